@@ -1,0 +1,1 @@
+"""Partially observable environments as pure JAX functions: grid worlds and robot tasks."""

@@ -1,0 +1,130 @@
+"""The contract of an environment.
+
+An environment is an immutable object whose `reset` and `step` are pure functions of their arguments, so that they can
+be compiled, mapped over a batch and scanned over time. Everything an environment remembers lives in its `EnvState`.
+Two rules keep learning correct:
+
+* `step` never resets. Who runs the environment resets it, with a fresh key, so that hidden variables are drawn anew
+  and the final observation of an episode is never lost.
+* `TimeStep.observation` is all that a policy may ever see; `TimeStep.state` is for training only.
+"""
+
+import abc
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+EnvState = Any
+"""Whatever pytree an environment needs to continue: its own frozen dataclass."""
+
+
+@struct.dataclass
+class TimeStep:
+    """What one step shows."""
+
+    observation: jax.Array  # (*observation_shape)  all that a policy may ever see
+    state: jax.Array  # (*state_shape)  privileged: training only
+    reward: jax.Array  # ()  float32, received on arriving here; 0 after a reset
+    terminated: jax.Array  # ()  bool: the task ended
+    truncated: jax.Array  # ()  bool: the time limit was reached
+
+    @property
+    def done(self) -> jax.Array:
+        """() bool: the episode is over, for either reason."""
+        return self.terminated | self.truncated
+
+
+@dataclasses.dataclass(frozen=True)
+class ArraySpec:
+    """Shape and dtype of an observation or a state. Images are (rows, columns, channels)."""
+
+    shape: tuple[int, ...]
+    dtype: Any = np.float32
+
+    @property
+    def is_image(self) -> bool:
+        """Whether the array has rows, columns and channels."""
+        return len(self.shape) == 3
+
+
+@dataclasses.dataclass(frozen=True)
+class DiscreteActions:
+    """Actions 0 .. num - 1, int32 scalars."""
+
+    num: int
+    names: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class ContinuousActions:
+    """Actions in [-1, 1]^size, float32 vectors."""
+
+    size: int
+    names: tuple[str, ...] = ()
+
+
+ActionSpec = DiscreteActions | ContinuousActions
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """A ground-truth quantity that probes try to decode from learned features.
+
+    `num_values` is the number of classes of a categorical variable, whose values are 0 .. num_values - 1; None means a
+    real number. `hidden` tells whether a single observation usually leaves it unknown.
+    """
+
+    name: str
+    hidden: bool
+    num_values: int | None = None
+
+
+class Environment(abc.ABC):
+    """A partially observable task whose true state is available during training.
+
+    Subclasses set the attributes below and implement `reset` and `step`; the other methods are optional.
+    """
+
+    name: str
+    """Short name for files and tables."""
+    horizon: int
+    """Time limit of an episode, in steps."""
+    observation_spec: ArraySpec
+    state_spec: ArraySpec
+    action_spec: ActionSpec
+    variables: tuple[Variable, ...] = ()
+    """What `ground_truth` returns, for probes; empty when nothing is declared."""
+
+    @abc.abstractmethod
+    def reset(self, key: jax.Array) -> tuple[EnvState, TimeStep]:
+        """Start an episode: draw the hidden variables and the start, show the first observation."""
+
+    @abc.abstractmethod
+    def step(self, key: jax.Array, env_state: EnvState, action: jax.Array) -> tuple[EnvState, TimeStep]:
+        """Apply `action`. Never resets; stepping a finished episode is undefined."""
+
+    def success(self, timestep: TimeStep) -> jax.Array:
+        """() bool: whether the episode that ends with `timestep` solved the task. Default: it terminated rewarded."""
+        return timestep.terminated & (timestep.reward > 0)
+
+    def ground_truth(self, env_state: EnvState) -> jax.Array:
+        """(len(variables),) float32: the current values of `variables`."""
+        del env_state
+        return jnp.zeros((0,), jnp.float32)
+
+    def reveals(self, env_state: EnvState) -> jax.Array:
+        """() bool: whether the current observation shows what is otherwise hidden (an information cell)."""
+        del env_state
+        return jnp.zeros((), bool)
+
+    def max_distinct_observations(self, num_episodes: int) -> int | None:
+        """At most how many different observations `num_episodes` whole episodes can hold; None when unbounded.
+
+        Learners encode each distinct observation once when this is far below the number of steps.
+        """
+        del num_episodes
+        return None

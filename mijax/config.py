@@ -1,0 +1,200 @@
+"""Every option of a run, as frozen dataclasses. Presets of the six domains are in `configs/`."""
+
+import dataclasses
+from typing import Literal
+
+MemoryName = Literal["gpt", "gru"]
+IntrinsicForm = Literal["explained_variance", "cosine"]
+
+
+class ConfigError(ValueError):
+    """An option has a value that cannot be run; the message names the option and what is accepted."""
+
+
+def require(condition: bool, option: str, value: object, accepted: str) -> None:
+    """Raise `ConfigError` naming `option` unless `condition` holds."""
+    if not condition:
+        raise ConfigError(f"--{option}: got {value!r}, accepted: {accepted}")
+
+
+def _require_at_least(group: str, config: object, minimum: float, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        require(value >= minimum, f"{group}{name}".replace("_", "-"), value, f"a number >= {minimum}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage1Config:
+    """Representation learning (paper Section 3.1, Table 3)."""
+
+    episodes: int = 500
+    """Episodes of a random policy in the training set."""
+    heldout_episodes: int = 100
+    """Further episodes that only the probe sees."""
+    epochs: int = 1000
+    """Passes over the training set."""
+    batch_size: int = 500
+    """Transitions per update; the last partial batch of an epoch is dropped."""
+    learning_rate: float = 1e-3
+    """Adam step size of phi, psi, the dynamics model and the estimator of CLUB."""
+    features: int = 32
+    """Width of z_s and of z_o."""
+    lambda_r: float = 1.0
+    """Weight of the reward loss."""
+    lambda_s: float = 1.0
+    """Weight of the loss of the next state feature."""
+    lambda_o: float = 1.0
+    """Weight of the loss of the next observation feature."""
+    lambda_club: float = 1.0
+    """Weight of the upper bound of I(z_s; z_o), which is minimised."""
+    lambda_dim_s: float = 0.0
+    """Weight of the lower bound of I(s; z_s), which is maximised."""
+    lambda_dim_o: float = 1.0
+    """Weight of the lower bound of I(o; z_o), which is maximised."""
+    estimator_updates: int = 5
+    """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("stage1.", self, 1, "episodes", "heldout_episodes", "epochs", "batch_size", "features",
+                          "estimator_updates")
+        _require_at_least("stage1.", self, 0, "lambda_r", "lambda_s", "lambda_o", "lambda_club", "lambda_dim_s",
+                          "lambda_dim_o")
+        require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """The networks of the agent (paper Appendix A.7)."""
+
+    layers: int = 1
+    """Transformer blocks."""
+    heads: int = 2
+    """Attention heads per block."""
+    gru_width: int = 128
+    """Hidden units of the GRU, when the memory is one."""
+    action_embedding: int = 64
+    """Width of the embedded previous action."""
+    observation_embedding: int = 64
+    """Width of the embedded observation."""
+    critic_hidden: tuple[int, ...] = (256, 256)
+    """Hidden layers of the Q head."""
+    auxiliary_hidden: tuple[int, ...] = (128, 128)
+    """Hidden layers of the heads that predict z_s."""
+    dropout: float = 0.0
+    """Dropout in the transformer's residual branches, in gradient passes only: never while acting or in targets."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of the arithmetic; parameters stay float32."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("network.", self, 1, "layers", "heads", "gru_width", "action_embedding",
+                          "observation_embedding")
+        require(0 <= self.dropout < 1, "network.dropout", self.dropout, "a number in [0, 1)")
+
+
+@dataclasses.dataclass(frozen=True)
+class DQNConfig:
+    """Double DQN on whole episodes (paper Appendix A.6, Table 2)."""
+
+    learning_rate: float = 3e-4
+    """Adam step size."""
+    final_learning_rate: float = 1.0
+    """The step size falls linearly to this fraction of itself over the run's steps; 1 keeps it constant."""
+    discount: float = 0.99
+    """gamma."""
+    trace_decay: float = 0.0
+    """lambda of the Watkins Q(lambda) returns: 0 is the paper's one-step target."""
+    target_rate: float = 0.005
+    """tau: how far the target network moves towards the online network after every update."""
+    batch_episodes: int = 64
+    """Episodes per update."""
+    updates_per_step: float = 0.25
+    """Gradient updates per environment step."""
+    replay_steps: int = 1_000_000
+    """Capacity of the replay, in steps of full-length episodes."""
+    warmup_episodes: int = 10
+    """Random episodes before the first update."""
+    epsilon_final: float = 0.02
+    """Exploration at the end of its schedule (the paper's 1 / horizon)."""
+    epsilon_steps: int = 50_000
+    """Environment steps over which epsilon falls linearly from 1 (the paper: a tenth of the budget)."""
+    bootstrap_at_time_limit: bool = False
+    """Whether the value of the last state counts when the time limit ends an episode."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("dqn.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes", "epsilon_steps")
+        require(self.learning_rate > 0, "dqn.learning-rate", self.learning_rate, "a number > 0")
+        require(self.updates_per_step > 0, "dqn.updates-per-step", self.updates_per_step, "a number > 0")
+        for name in ("discount", "trace_decay", "target_rate", "epsilon_final", "final_learning_rate"):
+            value = getattr(self, name)
+            require(0 <= value <= 1, f"dqn.{name}".replace("_", "-"), value, "a number in [0, 1]")
+
+
+@dataclasses.dataclass(frozen=True)
+class InformationConfig:
+    """What the privileged features z_s are used for in stage 2 (paper Section 3.2)."""
+
+    auxiliary_weight: float = 0.5
+    """Weight of the memory branch's prediction of z_s, in fractions of the variance of z_s."""
+    intrinsic_weight: float = 0.5
+    """alpha: weight of the information bonus in the total reward."""
+    intrinsic_form: IntrinsicForm = "explained_variance"
+    """How the bonus measures the information gained about z_s in one step."""
+    start_from_psi: bool = True
+    """Whether the memoryless branch starts from stage 1's psi; otherwise from random weights."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("information.", self, 0, "auxiliary_weight", "intrinsic_weight")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConfig:
+    """Greedy evaluation during training."""
+
+    every: int = 1000
+    """Environment steps between evaluations."""
+    episodes: int = 20
+    """Episodes per evaluation."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("evaluation.", self, 1, "every", "episodes")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """A whole run."""
+
+    domain: str = "heaven_hell"
+    """A registered environment, or `package.module:EnvClass`."""
+    agent: str = "mi"
+    """Which agent of `mijax.agents.variants`."""
+    memory: MemoryName = "gpt"
+    """The sequence model of the memory branch."""
+    steps: int = 100_000
+    """Environment steps of stage 2."""
+    num_envs: int = 4
+    """Environments stepped side by side."""
+    steps_per_iteration: int = 5
+    """Steps in each environment between two rounds of updates."""
+    stage1: Stage1Config = dataclasses.field(default_factory=Stage1Config)
+    network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+    dqn: DQNConfig = dataclasses.field(default_factory=DQNConfig)
+    information: InformationConfig = dataclasses.field(default_factory=InformationConfig)
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+
+    def __post_init__(self) -> None:
+        _require_at_least("", self, 1, "steps", "num_envs", "steps_per_iteration")
+        updates = self.dqn.updates_per_step * self.iteration_steps
+        require(updates >= 1 and abs(updates - round(updates)) < 1e-9, "dqn.updates-per-step", self.dqn.updates_per_step,
+                f"a whole number of updates per iteration of num-envs x steps-per-iteration = {self.iteration_steps} steps")
+        require(self.evaluation.every % self.iteration_steps == 0, "evaluation.every", self.evaluation.every,
+                f"a multiple of num-envs x steps-per-iteration = {self.iteration_steps}")
+
+    @property
+    def iteration_steps(self) -> int:
+        """Environment steps of one learner iteration, over all environments."""
+        return self.num_envs * self.steps_per_iteration
+
+    @property
+    def updates_per_iteration(self) -> int:
+        """Gradient updates of one learner iteration."""
+        return round(self.dqn.updates_per_step * self.iteration_steps)

@@ -1,0 +1,41 @@
+"""Named frozen pytrees that pass between the rooms of the library. A shape comment stands on every field.
+
+Letters: E environments, R packed rows, L tokens per row, A actions, F features.
+"""
+
+from typing import Any
+
+import jax
+from flax import struct
+
+Params = Any
+"""A pytree of float32 parameters (Flax linen)."""
+Metrics = dict[str, jax.Array]
+"""Scalars by name."""
+
+
+@struct.dataclass
+class Representation:
+    """What stage 1 hands to stage 2: the frozen encoders and the scale of z_s."""
+
+    phi: Params  # state encoder, s -> z_s
+    psi: Params  # observation encoder, o -> z_o
+    z_s_mean: jax.Array  # (F,)  mean of z_s over the training set
+    z_s_variance: jax.Array  # ()  Tr Var(z_s) over the training set: the unit of the bonus and of the auxiliary loss
+
+
+@struct.dataclass
+class Tokens:
+    """Packed sequences: each row holds one or more whole episodes, one after the other.
+
+    Token t of an episode is what was known on arriving at step t: (a_{t-1}, o_t). Padding belongs to segment 0.
+    """
+
+    observation: jax.Array  # (R, L, *observation_shape)
+    previous_action: jax.Array  # (R, L) int32; -1 on the first token of an episode
+    reward: jax.Array  # (R, L) float32, received on arriving
+    terminated: jax.Array  # (R, L) bool, on arriving
+    truncated: jax.Array  # (R, L) bool, on arriving
+    segment: jax.Array  # (R, L) int32, which episode of the row, from 1; 0 is padding
+    position: jax.Array  # (R, L) int32, step within the episode
+    z_s: jax.Array | None  # (R, L, F) phi(s_t), or None when the agent does not use it

@@ -1,0 +1,26 @@
+"""How every test runs: on the CPU as two devices, with loud shapes and types, and with compiled programs kept on disk."""
+
+import os
+import pathlib
+from collections.abc import Iterator
+
+REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
+
+# These are read when jax is first imported, and are inherited by the commands that tests start.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("MPLBACKEND", "Agg")
+if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2".strip()
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def loud_shapes_and_types(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A broadcast between ranks is an error, and so is an implicit promotion of types unless the test is `lenient`."""
+    lenient = request.node.get_closest_marker("lenient") is not None
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("standard" if lenient else "strict"):
+        yield

@@ -53,19 +53,19 @@ class RunFolder:
     path: pathlib.Path
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], config: Mapping[str, Any] | Any) -> "RunFolder":
-        """Start a new run in `path`, which must be empty or not exist. `config` is a mapping or a dataclass."""
+    def create(cls, path: str | os.PathLike[str], config: Mapping[str, Any]) -> "RunFolder":
+        """Start a new run in `path`, which must be empty or not exist. `config` holds the run's options by name."""
         run = cls(pathlib.Path(path))
         if run._file("config.json").exists():
             raise RunError(f"{path}: already holds a run; continue it with --resume {path}, or choose another --out")
         with _named_errors(run.path):
             run.path.mkdir(parents=True, exist_ok=True)
-            foreign = sorted(entry.name for entry in run.path.iterdir() if not entry.name.startswith("versions.json"))
+            started = {"versions.json", "versions.json.tmp", "config.json.tmp"}  # a start that was killed leaves these
+            foreign = sorted({entry.name for entry in run.path.iterdir()} - started)
         if foreign:
             raise RunError(f"{path}: not empty and not a run (it holds {foreign[0]}); choose another --out")
         _write_json(run._file("versions.json"), _versions())
-        is_dataclass = dataclasses.is_dataclass(config) and not isinstance(config, type)
-        _write_json(run._file("config.json"), dataclasses.asdict(config) if is_dataclass else dict(config))
+        _write_json(run._file("config.json"), config)
         return run
 
     @classmethod
@@ -115,27 +115,14 @@ class RunFolder:
 
     def metrics(self, seed: int) -> list[Row]:
         """All lines of a seed; a last line torn by a kill is dropped, and so are numbers that were not finite."""
-        path = self._metrics_file(seed)
-        if not path.exists():
-            return []
-        with _named_errors(path):
-            lines = path.read_text(encoding="utf-8").split("\n")
-        rows = []
-        for number, line in enumerate(lines[:-1], start=1):  # a whole line ends in a newline
-            try:
-                row = json.loads(line)
-                row["step"] = int(row["step"])
-            except (ValueError, TypeError, KeyError):
-                raise RunError(f"{path}:{number}: not a line of metrics") from None
-            rows.append({name: value for name, value in row.items() if value is not None})
-        return rows
+        return [{name: value for name, value in row.items() if value is not None} for _, row in self._lines(seed)]
 
-    def truncate_after(self, step: int, seed: int | None = None) -> None:
-        """Drop the lines after `step` of one seed or of all, so that a resumed run can write them again."""
-        for one in self.seeds() if seed is None else (seed,):
-            kept = [row for row in self.metrics(one) if row["step"] <= step]
-            if self._metrics_file(one).exists():
-                _write_atomically(self._metrics_file(one), "".join(json.dumps(row) + "\n" for row in kept))
+    def truncate_after(self, step: int) -> None:
+        """Drop every seed's lines after `step`, so that a resumed run writes them again."""
+        for seed in self.seeds():
+            kept = [line for line, row in self._lines(seed) if row["step"] <= step]
+            if self._metrics_file(seed).exists():
+                _write_atomically(self._metrics_file(seed), "".join(f"{line}\n" for line in kept))
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write summary.json."""
@@ -145,6 +132,22 @@ class RunFolder:
         """summary.json, or None while the run has not ended."""
         path = self._file("summary.json")
         return _read_json(path) if path.exists() else None
+
+    def _lines(self, seed: int) -> list[tuple[str, Row]]:
+        path = self._metrics_file(seed)
+        if not path.exists():
+            return []
+        with _named_errors(path):
+            lines = path.read_text(encoding="utf-8").split("\n")[:-1]  # a whole line ends in a newline
+        rows = []
+        for number, line in enumerate(lines, start=1):
+            try:
+                row = json.loads(line)
+                row["step"] = int(row["step"])
+            except (ValueError, TypeError, KeyError):
+                raise RunError(f"{path}:{number}: not a line of metrics") from None
+            rows.append((line, row))
+        return rows
 
     def _file(self, name: str) -> pathlib.Path:
         return self.path / name
@@ -372,7 +375,8 @@ class ProgressDisplay:
         rate = (last_done - first_done) / (last_time - first_time) if last_time > first_time else 0.0
         parts = [f"{done:,}/{self._total:,} {self._unit}", f"{100 * done / max(self._total, 1):.0f}%"]
         if rate > 0:
-            parts += [f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.2g}/s", f"{_clock((self._total - done) / rate)} left"]
+            speed = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            parts += [f"{speed} {self._unit}/s", f"{_clock((self._total - done) / rate)} left"]
         parts += [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
         return "  ".join(parts)
 

@@ -109,6 +109,16 @@ def steps_to_threshold(steps: Sequence[int], values: Sequence[float], threshold:
     return next((int(step) for step, value in zip(steps, values, strict=True) if value >= threshold), None)
 
 
+def running_mean(values: Array, window: int) -> Array:
+    """At each point, the mean of the last `window` values up to it, of fewer at the start."""
+    if window == 1:
+        return _floats(values)
+    sums = np.concatenate([[0.0], np.cumsum(_floats(values))])
+    ends = np.arange(1, len(sums))
+    starts = np.maximum(ends - window, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)
+
+
 def onto_shared_steps(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Put curves that were measured at different steps on one axis, by linear interpolation, without extrapolation.
 

@@ -1,4 +1,4 @@
-"""How every test runs: on the CPU as two devices, with loud shapes and types, and with compiled programs kept on disk."""
+"""How every test runs: two devices on the CPU, loud shapes and types, compiled programs kept on disk."""
 
 import os
 import pathlib

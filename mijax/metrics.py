@@ -26,8 +26,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 Row = dict[str, Any]
@@ -342,9 +342,8 @@ class ProgressDisplay:
         self._last_line = -math.inf
         self._bar: Progress | None = None
         if self._console.is_terminal:
-            columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), _StatusColumn())
-            self._bar = Progress(*columns, console=self._console)
-            self._task = self._bar.add_task(label, total=total, completed=start, status=self._status(start, {}))
+            self._bar = _TwoLines(console=self._console)
+            self._task = self._bar.add_task(label, total=total, completed=start, speed=self._speed(start), numbers="")
 
     def __enter__(self) -> "ProgressDisplay":
         if self._bar is not None:
@@ -359,33 +358,39 @@ class ProgressDisplay:
         """Report that `done` units are done in all, with the latest numbers by name."""
         now = time.monotonic()
         self._reports.append((now, done))
-        status = self._status(done, values or {})
+        speed = self._speed(done)
+        numbers = "  ".join(f"{name} {value:.3g}" for name, value in (values or {}).items() if value is not None)
         if self._bar is not None:
-            self._bar.update(self._task, completed=done, status=status)
+            self._bar.update(self._task, completed=done, speed=speed, numbers=numbers)
         elif now - self._last_line >= self._interval or done >= self._total:
             self._last_line = now
-            self._console.print(f"{self._label}  {status}", soft_wrap=True, markup=False)
+            self._console.print(f"{self._label}  {speed}  {numbers}".rstrip(), soft_wrap=True, markup=False)
 
     def print(self, line: str) -> None:
         """Show a line of its own, above the bar."""
         self._console.print(line, soft_wrap=True, markup=False)
 
-    def _status(self, done: int, values: Mapping[str, float]) -> str:
+    def _speed(self, done: int) -> str:
         (first_time, first_done), (last_time, last_done) = self._reports[0], self._reports[-1]
         rate = (last_done - first_done) / (last_time - first_time) if last_time > first_time else 0.0
         parts = [f"{done:,}/{self._total:,} {self._unit}", f"{100 * done / max(self._total, 1):.0f}%"]
         if rate > 0:
-            speed = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
-            parts += [f"{speed} {self._unit}/s", f"{_clock((self._total - done) / rate)} left"]
-        parts += [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
+            shown = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            parts += [f"{shown} {self._unit}/s", f"{_clock((self._total - done) / rate)} left"]
         return "  ".join(parts)
 
 
-class _StatusColumn(ProgressColumn):
-    """The same text that plain lines show; on a narrow terminal its end is cut instead of the bar."""
+class _TwoLines(Progress):
+    """The bar with its speed, and under it the numbers: both fit a terminal of 80 columns, a longer line is cut."""
 
-    def render(self, task: Task) -> Text:
-        return Text(task.fields["status"], no_wrap=True, overflow="ellipsis")
+    def __init__(self, console: Console) -> None:
+        super().__init__(TextColumn("{task.description}"), BarColumn(bar_width=12), TextColumn("{task.fields[speed]}"),
+                         console=console)
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        yield self.make_tasks_table(self.tasks)
+        for task in self.tasks:
+            yield Text(task.fields["numbers"], style="cyan", no_wrap=True, overflow="ellipsis")
 
 
 def _clock(seconds: float) -> str:

@@ -1,0 +1,188 @@
+"""The run folder survives kills and says what is wrong with it; progress is readable."""
+
+import io
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+from mijax import metrics
+from mijax.metrics import ProgressDisplay, RunError, RunFolder
+
+CONFIG = {"domain": "heaven_hell", "agent": "mi", "memory": "gpt", "critic_hidden": (256, 256)}
+
+
+@pytest.fixture
+def run(tmp_path):
+    return RunFolder.create(tmp_path / "run", CONFIG)
+
+
+def one_line(error: pytest.ExceptionInfo[RunError]) -> str:
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_create_and_open(run):
+    opened = RunFolder.open(run.path)
+    assert opened.config() == {**CONFIG, "critic_hidden": [256, 256]}
+    assert {"python", "jax", "flax", "optax", "numpy", "mijax", "platform", "commit"} <= opened.versions().keys()
+    assert opened.seeds() == ()
+    assert opened.summary() is None
+    opened.write_summary({"seeds": {3: {"success": np.float32(1.0), "steps_to_solve": None}}})
+    assert opened.summary() == {"seeds": {"3": {"success": 1.0, "steps_to_solve": None}}}
+
+
+def test_metrics_come_back_exactly(run):
+    value = np.float32(0.1) * np.float32(3)
+    run.append(3, {"step": jnp.int32(1000), "loss/td": jnp.float32(value), "evaluation/success": 0.5})
+    run.append(11, {"step": 1000, "loss/td": float("nan"), "note": "x"})
+    assert run.seeds() == (3, 11)
+    assert run.metrics(3) == [{"step": 1000, "loss/td": float(value), "evaluation/success": 0.5}]
+    assert run.metrics(11) == [{"step": 1000, "note": "x"}]
+    assert run.metrics(4) == []
+
+
+def test_a_torn_last_line_is_dropped_and_a_resumed_run_writes_the_same_file(run):
+    def write(from_step: int) -> None:
+        for step in range(from_step, 5):
+            run.append(0, {"step": step, "loss/td": None if step == 1 else step / 3})
+
+    write(1)
+    path = run.seed_path(0) / "metrics.jsonl"
+    whole = path.read_bytes()
+    for kept in range(len(whole.split(b"\n", 2)[0]) + 1, len(whole)):  # killed at any byte after the first line
+        path.write_bytes(whole[:kept])
+        last = run.metrics(0)[-1]["step"]
+        run.truncate_after(last)
+        write(last + 1)
+        assert path.read_bytes() == whole
+    run.truncate_after(2)
+    assert [row["step"] for row in run.metrics(0)] == [1, 2]
+
+
+def test_a_killed_start_can_be_started_again(tmp_path):
+    (tmp_path / "versions.json").write_text("{")
+    (tmp_path / "config.json.tmp").write_text("{")
+    with pytest.raises(RunError, match=r"no config\.json"):
+        RunFolder.open(tmp_path)
+    assert RunFolder.create(tmp_path, CONFIG).versions()["python"]
+
+
+def test_unusable_folders_are_named(tmp_path, run):
+    with pytest.raises(RunError, match="already holds a run; continue it with --resume") as error:
+        RunFolder.create(run.path, CONFIG)
+    assert str(run.path) in one_line(error)
+
+    with pytest.raises(RunError, match="no such run folder") as error:
+        RunFolder.open(tmp_path / "missing")
+    one_line(error)
+
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.tex").touch()
+    with pytest.raises(RunError, match=r"not empty and not a run \(it holds thesis\.tex\)") as error:
+        RunFolder.create(foreign, CONFIG)
+    one_line(error)
+    (foreign / "config.json").write_text('{"lr": 1}')
+    with pytest.raises(RunError, match="names no domain") as error:
+        RunFolder.open(foreign)
+    one_line(error)
+
+    with pytest.raises(RunError, match="is a run with domain 'heaven_hell', wanted 'sphinx'") as error:
+        run.require(domain="sphinx")
+    one_line(error)
+    run.require(domain="heaven_hell", agent="mi")
+
+    (run.path / "config.json").write_text('{"domain": "heav')
+    with pytest.raises(RunError, match="corrupt or half-written") as error:
+        RunFolder.open(run.path)
+    one_line(error)
+
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(RunError, match="Not a directory") as error:
+        RunFolder.create(file / "run", CONFIG)
+    one_line(error)
+
+
+def test_a_corrupt_line_is_named(run):
+    run.append(0, {"step": 1})
+    with (run.seed_path(0) / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 2, "loss\n{"step": 3}\n')
+    with pytest.raises(RunError, match=r"metrics\.jsonl:2: not a line of metrics") as error:
+        run.metrics(0)
+    one_line(error)
+
+
+def test_a_full_disk_is_one_line_and_keeps_the_old_summary(run, monkeypatch):
+    def no_space(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    run.write_summary({"seeds": {}})
+    monkeypatch.setattr(metrics.os, "fsync", no_space)
+    with pytest.raises(RunError, match=r"summary\.json: No space left on device") as error:
+        run.write_summary({"seeds": {"0": {}}})
+    one_line(error)
+    assert run.summary() == {"seeds": {}}
+
+
+def test_trackers(run, monkeypatch):
+    tracker = metrics.make_tracker("none", run)
+    tracker.log(0, {"step": 1, "loss/td": 0.1})
+    tracker.close()
+    with pytest.raises(RunError, match="accepted: none, tensorboard, wandb"):
+        metrics.make_tracker("comet", run)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setitem(metrics.sys.modules, "wandb", None)
+    with pytest.raises(RunError, match="pip install"):
+        metrics.make_tracker("wandb", run)
+
+
+def test_tensorboard_gets_the_metrics_of_each_seed(run):
+    pytest.importorskip("tensorboardX")
+    tracker = metrics.make_tracker("tensorboard", run)
+    for seed in (0, 3):
+        tracker.log(seed, {"step": 10, "loss/td": np.float32(0.5), "loss/f": float("nan")})
+    tracker.close()
+    assert all(list((run.seed_path(seed) / "tensorboard").iterdir()) for seed in (0, 3))
+
+
+class Clock:
+    """A clock that moves when told."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.now = 0.0
+        monkeypatch.setattr(metrics.time, "monotonic", lambda: self.now)
+
+
+def test_plain_lines_come_at_a_steady_pace(monkeypatch):
+    clock = Clock(monkeypatch)
+    console = Console(file=io.StringIO(), force_terminal=False)
+    with ProgressDisplay("stage 2", total=10_000, interval=10.0, console=console) as progress:
+        progress.print("compiled in 11.8 s")
+        for step in range(1000, 10_001, 1000):
+            clock.now += 4.0
+            progress.update(step, {"success": 0.5, "loss/td": 0.01234})
+    lines = console.file.getvalue().splitlines()  # pyright: ignore[reportAttributeAccessIssue]
+    assert lines[0] == "compiled in 11.8 s"
+    assert lines[1] == "stage 2  1,000/10,000 steps  10%  250 steps/s  00:36 left  success 0.5  loss/td 0.0123"
+    assert lines[-1].startswith("stage 2  10,000/10,000 steps  100%")
+    assert len(lines) == 1 + 4  # after 4, 16, 28 and 40 seconds
+
+
+def test_a_terminal_gets_a_bar(monkeypatch):
+    clock = Clock(monkeypatch)
+    console = Console(file=io.StringIO(), force_terminal=True, width=160, height=20, _environ={"TERM": "xterm"})
+    with ProgressDisplay("stage 1", total=7200, start=3600, unit="epochs", console=console) as progress:
+        clock.now += 1800.0
+        progress.update(3601)
+    text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    assert "3,601/7,200 epochs" in text
+    assert "1799:30:00 left" in text
+    assert "━" in text
+
+
+def test_config_is_plain_json(run):
+    assert json.loads((run.path / "config.json").read_text())["critic_hidden"] == [256, 256]

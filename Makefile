@@ -44,7 +44,7 @@ clean:
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
-		echo "mijax needs Python >= 3.11; found: $$("$(or $(PYTHON),python3)" --version 2>&1 || echo none)." \
+		echo "mijax needs Python >= 3.11; found: $$("$(or $(PYTHON),python3)" --version 2>/dev/null || echo none)." \
 			"Name another one: make PYTHON=/path/to/python3.12 ..." >&2; exit 1; }
 	"$(PYTHON)" -m venv --clear $(VENV)
 	$(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'

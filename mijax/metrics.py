@@ -249,7 +249,7 @@ class Tracker(Protocol):
 
 
 def make_tracker(name: TrackerName, run: RunFolder) -> Tracker:
-    """The tracker called `name`, writing inside the run folder."""
+    """The tracker called `name`, writing inside the run folder. A resumed run logs once more what it does again."""
     kinds = {"none": _NoTracker, "tensorboard": _TensorBoardTracker, "wandb": _WandbTracker}
     if name not in kinds:
         raise RunError(f"--track: got {name!r}, accepted: {', '.join(kinds)}")
@@ -303,6 +303,7 @@ class _WandbTracker:
         self._start = lambda seed: wandb.init(
             project="mijax", group=run.path.name, name=f"{run.path.name}/seed_{seed}", dir=str(run.path),
             config={**config, "seed": seed}, mode="offline", reinit="create_new",
+            settings=wandb.Settings(silent=True, console="off"),
         )
         self._runs: dict[int, Any] = {}
 

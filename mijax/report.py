@@ -423,7 +423,7 @@ class ReportOptions:
     runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
     """Run folders, finished or not."""
     out: pathlib.Path | None = None
-    """Folder for the figures and tables; default: the run itself for a single one, otherwise `report`."""
+    """Folder for the figures and tables; default: the run itself for a single one, otherwise `runs/report`."""
     labels: tuple[str, ...] = ()
     """A name for each run; default: the agent, and what else tells the runs apart."""
     smooth: int = 1
@@ -440,7 +440,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise RunError("runs: got none, accepted: one run folder or more")
         if options.smooth < 1:
             raise RunError(f"--smooth: got {options.smooth}, accepted: a number >= 1")
-        out = options.out or (options.runs[0] if len(options.runs) == 1 else pathlib.Path("report"))
+        out = options.out or (options.runs[0] if len(options.runs) == 1 else pathlib.Path("runs/report"))
         print(write_report(load(options.runs, options.labels), out, smooth=options.smooth, note=options.note))
         print(f"Written to {out}")
     except (RunError, OSError) as error:

@@ -38,7 +38,7 @@ def frame(env: Environment, env_state: GridState) -> np.ndarray:
     row, column = divmod(int(env_state.cell), columns)
     x, y, margin = column * _CELL, row * _CELL, _CELL // 4
     draw.ellipse((x + margin, y + margin, x + _CELL - margin, y + _CELL - margin), fill=_AGENT)
-    draw.text((4, rows * _CELL + 3), _caption(world, env_state), fill=_INK, font=ImageFont.load_default(size=13))
+    draw.text((4, rows * _CELL + 3), _caption(world, env_state), fill=_INK, font=ImageFont.load_default(size=12))
     return np.asarray(image)
 
 
@@ -76,5 +76,5 @@ def _layout(env: Environment, env_state: GridState) -> tuple[GridWorld, list[lis
 def _caption(world: GridWorld, env_state: GridState) -> str:
     time, cell, goal = int(env_state.time), int(env_state.cell), int(env_state.goal)
     reward = float(world.tables.rewards[cell, goal]) if time else 0.0
-    shown = "   goal shown" if world.tables.informs[cell] else ""
-    return f"step {time}   reward {reward:g}{shown}"
+    shown = "  goal shown" if world.tables.informs[cell] else ""
+    return f"step {time}  reward {reward:g}{shown}"

@@ -1,0 +1,222 @@
+"""One conformance suite over every registered environment, and the registry's errors."""
+
+import functools
+import subprocess
+import sys
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs_mjx import registry
+from envs_mjx.base import ArraySpec, ContinuousActions, Environment, EnvState, TimeStep
+from envs_mjx.grid import HeavenHell
+from envs_mjx.grid.world import GridState, GridWorld
+
+NUM_EPISODES = 64
+
+
+class Episodes(NamedTuple):
+    """Random episodes of one environment, on the host: E episodes, T = horizon steps after the reset."""
+
+    env: Environment
+    keys: jax.Array  # (E,) of the resets
+    actions: jax.Array  # (E, T, ...)
+    states: EnvState  # (E, T + 1, ...)
+    timesteps: TimeStep  # (E, T + 1, ...)
+    truth: np.ndarray  # (E, T + 1, variables)
+    valid: np.ndarray  # (E, T + 1) bool, up to the end of the episode
+
+
+@pytest.fixture(scope="module", params=registry.names())
+def episodes(request: pytest.FixtureRequest) -> Episodes:
+    env = registry.make(request.param)
+
+    def play(key):
+        keys = jax.random.split(key, env.horizon)
+        actions = jax.vmap(lambda k: registry.sample_action(env, k))(keys)
+        first = env.reset(key)
+
+        def step(env_state, inputs):
+            following = env.step(inputs[0], env_state, inputs[1])
+            return following[0], following
+
+        _, rest = jax.lax.scan(step, first[0], (keys, actions))
+        states, timesteps = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+        return actions, states, timesteps, jax.vmap(env.ground_truth)(states)
+
+    keys = jax.random.split(jax.random.key(5), NUM_EPISODES)
+    actions, states, timesteps, truth = jax.device_get(jax.jit(jax.vmap(play))(keys))
+    ended_before = np.cumsum(timesteps.done, axis=1) - timesteps.done
+    return Episodes(env, keys, actions, states, timesteps, truth, ended_before == 0)
+
+
+def test_check_contract(episodes: Episodes) -> None:
+    registry.check_contract(episodes.env)
+
+
+def test_name_is_the_registered_one(episodes: Episodes) -> None:
+    assert type(registry.make(episodes.env.name)) is type(episodes.env)
+
+
+def test_truncates_at_the_horizon_unless_terminated(episodes: Episodes) -> None:
+    timesteps, valid, horizon = episodes.timesteps, episodes.valid, episodes.env.horizon
+    assert not (timesteps.terminated & timesteps.truncated).any()
+    assert not timesteps.truncated[:, :horizon][valid[:, :horizon]].any()
+    reached = valid[:, horizon]
+    assert reached.any()
+    assert timesteps.done[reached, horizon].all()
+
+
+def test_step_never_resets_and_reset_draws_anew(episodes: Episodes) -> None:
+    """Hidden variables stay the same up to the last step of an episode, and differ between episodes."""
+    hidden = [i for i, variable in enumerate(episodes.env.variables) if variable.hidden]
+    assert hidden
+    for index in hidden:
+        values = episodes.truth[..., index]
+        assert (values == values[:, :1])[episodes.valid].all()
+        assert len(np.unique(values[:, 0])) > 1
+
+
+def test_same_key_same_episode(episodes: Episodes) -> None:
+    """Alone as in a batch: jit equals vmap."""
+    env, last = episodes.env, 3
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    env_state, timestep = reset(episodes.keys[last])
+    keys = jax.random.split(episodes.keys[last], env.horizon)
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5)
+    for time in range(4):
+        expected = jax.tree.map(lambda x, t=time: x[last, t], (episodes.states, episodes.timesteps))
+        jax.tree.map(close, (env_state, timestep), expected)
+        if timestep.done:
+            break
+        env_state, timestep = step(keys[time], env_state, episodes.actions[last, time])
+
+
+def test_success_ends_an_episode(episodes: Episodes) -> None:
+    success = np.asarray(jax.vmap(jax.vmap(episodes.env.success))(episodes.timesteps))
+    assert not (success & ~episodes.timesteps.done)[episodes.valid].any()
+
+
+def test_distinct_observations_within_the_bound(episodes: Episodes) -> None:
+    observations = episodes.timesteps.observation.reshape(NUM_EPISODES, episodes.env.horizon + 1, -1)
+    for num in (1, 8, NUM_EPISODES):
+        bound = episodes.env.max_distinct_observations(num)
+        if bound is not None:
+            assert len(np.unique(observations[:num][episodes.valid[:num]], axis=0)) <= bound
+
+
+def test_hidden_variable_is_invisible_off_the_information_cells(episodes: Episodes) -> None:
+    env = episodes.env
+    if not isinstance(env, GridWorld):
+        pytest.skip("swapping the hidden variable needs a grid world")
+    cells = np.flatnonzero(~env.tables.walls.reshape(-1)).astype(np.int32)
+    num_goals = len(env.tables.goals)
+
+    def arrive(cell, goal):
+        """Every way of arriving anywhere from `cell`."""
+        actions = jnp.arange(4, dtype=jnp.int32)
+        before = GridState(cell, goal, jnp.int32(0))
+        after, timesteps = jax.vmap(lambda action: env.step(jax.random.key(0), before, action))(actions)
+        return timesteps.observation, timesteps.state, jax.vmap(env.reveals)(after)
+
+    over_goals = jax.vmap(arrive, (None, 0))
+    goals = jnp.arange(num_goals, dtype=jnp.int32)
+    seen, states, reveals = jax.device_get(jax.jit(jax.vmap(over_goals, (0, None)))(cells, goals))
+    seen, states = (x.reshape(len(cells), num_goals, 4, -1) for x in (seen, states))
+    assert (reveals == reveals[:, :1]).all()
+    assert (seen == seen[:, :1]).all(-1)[~reveals].all()
+    assert (seen == states)[reveals].all()
+    for at_cell in states[:, :, 0]:
+        assert len(np.unique(at_cell, axis=0)) == num_goals
+
+
+# The registry
+
+
+def test_unknown_names() -> None:
+    with pytest.raises(registry.UnknownDomain, match=r"'heven_hell': accepted are heaven_hell, sphinx, carflag_2d"):
+        registry.make("heven_hell")
+    with pytest.raises(registry.UnknownDomain, match="importing 'no_such_module' failed: ModuleNotFoundError"):
+        registry.make("no_such_module:Env")
+    with pytest.raises(registry.UnknownDomain, match="no class 'Nothing'"):
+        registry.make("envs_mjx.grid:Nothing")
+    with pytest.raises(registry.UnknownDomain, match="importing '' failed"):
+        registry.make(":Nothing")
+    with pytest.raises(registry.UnknownDomain, match="makes a dict, not an"):
+        registry.make("builtins:dict")
+    with pytest.raises(registry.UnknownDomain, match="cannot be made without arguments"):
+        registry.make("envs_mjx.base:DiscreteActions")
+
+
+def test_environment_of_the_current_directory(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_worlds.py").write_text(
+        "from envs_mjx.grid import HeavenHell\nclass Mine(HeavenHell):\n    name = 'mine'\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    env = registry.make("my_worlds:Mine")
+    registry.check_contract(env)
+    assert env.name == "mine"
+
+
+def test_register(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
+    registry.register("again", HeavenHell)
+    registry.register("again", HeavenHell)
+    assert "again" in registry.names()
+    assert isinstance(registry.make("again"), HeavenHell)
+    with pytest.raises(ValueError, match="'again' is taken"):
+        registry.register("again", "envs_mjx.grid:Sphinx")
+    with pytest.raises(ValueError, match="without a colon"):
+        registry.register("a:b", HeavenHell)
+
+
+def test_registry_needs_no_physics() -> None:
+    code = ("import sys; from envs_mjx import registry; registry.make('sphinx'); "
+            "assert not {'mujoco', 'brax'} & set(sys.modules)")
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def _with_timestep(**changes):
+    """Heaven-Hell whose step returns other values of some fields."""
+
+    class Broken(HeavenHell):
+        def step(self, key, env_state, action):
+            env_state, timestep = super().step(key, env_state, action)
+            return env_state, timestep.replace(  # pyright: ignore[reportAttributeAccessIssue]
+                **{name: change(getattr(timestep, name)) for name, change in changes.items()})
+
+    return Broken()
+
+
+def _with(**attributes):
+    """Heaven-Hell with other attributes or methods."""
+    return type("Broken", (HeavenHell,), attributes)()
+
+
+@pytest.mark.parametrize(("env", "message"), [
+    (_with_timestep(reward=lambda x: x.astype(jnp.int32)), r"reward of step is 'int32\[\]', expected float32\[\]"),
+    (_with_timestep(reward=lambda x: x[None]), r"reward of step is 'float32\[1\]', expected float32\[\]"),
+    (_with_timestep(terminated=lambda x: x.astype(jnp.float32)), r"terminated of step is 'float32\[\]', expected bool"),
+    (_with_timestep(observation=lambda x: x[:2]), r"observation of step is 'float32\[2\]', expected float32\[3\]"),
+    (_with_timestep(observation=lambda x: x / 0), "observation of step is 'not finite'"),
+    (_with(state_spec=ArraySpec((4,))), r"state of reset is 'float32\[3\]', expected float32\[4\]"),
+    (_with(horizon=0), "horizon is 0, expected at least 1"),
+    (_with(action_spec=ContinuousActions(2)), "step cannot be traced by JAX"),
+    (_with(variables=()), r"ground_truth is 'float32\[3\]', expected float32\[0\]"),
+    (_with(ground_truth=lambda self, env_state: jnp.array([2.0, 0.0, 0.0])),
+     r"'side' after reset is 2.0, expected a class in 0 \.\. 1"),
+    (_with(max_distinct_observations=lambda self, num: 0), r"max_distinct_observations\(1\) is 0"),
+    (_with(reset=lambda self, key: None), "what reset returns is 'NoneType'"),
+    (_with(step=lambda self, key, env_state, action: (env_state.cell, self.reset(key)[1])), "the EnvState of step"),
+    (_with(step=lambda self, key, env_state, action: (
+        env_state.replace(time=env_state.time * 1.0), self.reset(key)[1])), r"EnvState.time of step is 'float32\[\]'"),
+    (_with(step=lambda self, key, env_state, action: 1 if action > 0 else 2), "step cannot be traced by JAX: Tracer"),
+])
+@pytest.mark.lenient
+def test_broken_contracts(env: Environment, message: str) -> None:
+    with pytest.raises(registry.ContractError, match=message) as caught:
+        registry.check_contract(env)
+    assert "\n" not in str(caught.value)

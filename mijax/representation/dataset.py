@@ -1,0 +1,149 @@
+"""Transitions (s, o, a, r, s', o') of a random policy, stored as indices into the distinct states and observations.
+
+Letters: N transitions, S distinct states, D distinct observations, V ground-truth variables.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from envs_mjx.base import ActionSpec, DiscreteActions, Environment
+
+
+@struct.dataclass
+class Transitions:
+    """Whole episodes, one row per transition; each distinct frame is stored once, in its own dtype."""
+
+    states: jax.Array  # (S, *state_shape)  distinct states
+    observations: jax.Array  # (D, *observation_shape)  distinct observations
+    state: jax.Array  # (N,) int32  row of `states`
+    observation: jax.Array  # (N,) int32  row of `observations`
+    action: jax.Array  # (N,) int32, or (N, size) float32 when continuous
+    reward: jax.Array  # (N,) float32, received on arriving at the next state
+    next_state: jax.Array  # (N,) int32
+    next_observation: jax.Array  # (N,) int32
+    terminal: jax.Array  # (N,) bool  whether the task ended there; the time limit is no end of the task
+    ground_truth: jax.Array  # (N, V) float32  `Environment.variables` before the action
+    reveals: jax.Array  # (N,) bool  whether `observation` shows what is otherwise hidden
+    episode: jax.Array  # (N,) int32
+
+    @property
+    def size(self) -> int:
+        """N, the number of transitions."""
+        return self.reward.shape[0]
+
+
+@struct.dataclass
+class Episodes:
+    """Rectangular episodes of at most T steps; what follows the end of an episode is meaningless.
+
+    Frames have T + 1 entries: the one that ends an episode is the last of its `length` + 1.
+    """
+
+    state: jax.Array  # (E, T + 1, *state_shape)
+    observation: jax.Array  # (E, T + 1, *observation_shape)
+    action: jax.Array  # (E, T, ...)
+    reward: jax.Array  # (E, T) float32
+    terminated: jax.Array  # (E, T) bool, on arriving
+    ground_truth: jax.Array  # (E, T + 1, V) float32
+    reveals: jax.Array  # (E, T + 1) bool
+    length: jax.Array  # (E,) int32  steps of each episode
+
+
+def random_action(spec: ActionSpec, key: jax.Array) -> jax.Array:
+    """An action drawn uniformly: () int32, or (size,) float32 in [-1, 1]."""
+    if isinstance(spec, DiscreteActions):
+        return jax.random.randint(key, (), 0, spec.num, jnp.int32)
+    return jax.random.uniform(key, (spec.size,), jnp.float32, -1.0, 1.0)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def random_episodes(env: Environment, key: jax.Array, num_episodes: int) -> Episodes:
+    """`num_episodes` whole episodes of the uniform random policy, side by side."""
+
+    def frame(env_state, timestep):
+        return timestep.state, timestep.observation, env.ground_truth(env_state), env.reveals(env_state)
+
+    def rollout(episode_key):
+        keys = jax.random.split(episode_key, env.horizon + 1)
+        first_state, first = env.reset(keys[0])
+
+        def step(carry, step_key):
+            env_state, alive = carry
+            action_key, env_key = jax.random.split(step_key)
+            action = random_action(env.action_spec, action_key)
+            env_state, timestep = env.step(env_key, env_state, action)
+            arrived = (action, timestep.reward, timestep.terminated)
+            return (env_state, alive & ~timestep.done), (arrived, frame(env_state, timestep), alive)
+
+        start = (first_state, jnp.ones((), bool))
+        _, ((action, reward, terminated), frames, alive) = jax.lax.scan(step, start, keys[1:])
+        whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), frame(first_state, first), frames)
+        return action, reward, terminated, whole, jnp.sum(alive, dtype=jnp.int32)
+
+    action, reward, terminated, whole, length = jax.vmap(rollout)(jax.random.split(key, num_episodes))
+    state, observation, ground_truth, reveals = whole
+    return Episodes(state=state, observation=observation, action=action, reward=reward, terminated=terminated,
+                    ground_truth=ground_truth, reveals=reveals, length=length)
+
+
+def flatten(episodes: Episodes) -> Transitions:
+    """Cut episodes into transitions and store each distinct frame once."""
+    e = jax.tree.map(np.asarray, episodes)
+    num_episodes, horizon = e.reward.shape
+    row, step = np.nonzero(np.arange(horizon) < e.length[:, None])
+    seen = np.arange(horizon + 1) <= e.length[:, None]
+    states, state_index = _distinct(e.state, seen)
+    observations, observation_index = _distinct(e.observation, seen)
+    columns = Transitions(
+        states=states, observations=observations, state=state_index[row, step],
+        observation=observation_index[row, step], action=e.action[row, step], reward=e.reward[row, step],
+        next_state=state_index[row, step + 1], next_observation=observation_index[row, step + 1],
+        terminal=e.terminated[row, step], ground_truth=e.ground_truth[row, step], reveals=e.reveals[row, step],
+        episode=row.astype(np.int32))
+    return jax.tree.map(jnp.asarray, columns)
+
+
+def _distinct(frames: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct frames of (E, T + 1, ...) where `seen`, and (E, T + 1) int32 which of them stands where."""
+    flat = np.ascontiguousarray(frames[seen])
+    as_bytes = flat.reshape(len(flat), -1).view(np.dtype((np.void, flat[0].nbytes))).ravel()
+    _, first, inverse = np.unique(as_bytes, return_index=True, return_inverse=True)
+    index = np.full(seen.shape, -1, np.int32)
+    index[seen] = inverse
+    return flat[first], index
+
+
+@struct.dataclass
+class TransitionTable:
+    """The K distinct transitions of a data set, as rows of indices into its distinct frames."""
+
+    state: jax.Array  # (K,) int32
+    observation: jax.Array  # (K,) int32
+    action: jax.Array  # (K,) int32, or (K, size) float32
+    reward: jax.Array  # (K,) float32
+    next_state: jax.Array  # (K,) int32
+    next_observation: jax.Array  # (K,) int32
+    terminal: jax.Array  # (K,) bool
+
+    @property
+    def size(self) -> int:
+        """K, the number of distinct transitions."""
+        return self.reward.shape[0]
+
+
+def tabulate(transitions: Transitions) -> tuple[TransitionTable, jax.Array]:
+    """The distinct transitions, and (N,) int32 which of them each transition is."""
+    columns = TransitionTable(**{f.name: getattr(transitions, f.name) for f in dataclasses.fields(TransitionTable)})
+    table = [np.asarray(c, np.float64).reshape(transitions.size, -1) for c in jax.tree.leaves(columns)]
+    _, first, inverse = np.unique(np.concatenate(table, axis=1), axis=0, return_index=True, return_inverse=True)
+    return jax.tree.map(lambda c: c[first], columns), jnp.asarray(inverse.reshape(-1), jnp.int32)
+
+
+def collect(env: Environment, key: jax.Array, num_episodes: int) -> Transitions:
+    """The transitions of `num_episodes` episodes of the random policy (Appendix C.1)."""
+    return flatten(random_episodes(env, key, num_episodes))

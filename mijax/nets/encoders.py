@@ -33,24 +33,11 @@ class ConvBlock:
         return ((size - self.kernel) // self.stride + 1) // self.pool
 
 
-def quantize(z: jax.Array, levels: int) -> jax.Array:
-    """Squash each feature to [-1, 1] and round it to the nearest of `levels` equidistant values.
-
-    The gradient is that of tanh: rounding passes it through unchanged (finite scalar quantisation, Mentzer et al. 2023).
-    """
-    squashed = jnp.tanh(z)
-    steps = (levels - 1) / 2
-    rounded = jnp.round((squashed + 1) * steps) / steps - 1
-    return squashed + jax.lax.stop_gradient(rounded - squashed)
-
-
 class VectorEncoder(nn.Module):
     """(..., D) -> (..., features): an MLP (paper Fig. 26)."""
 
     hidden: tuple[int, ...]
     features: int
-    levels: int | None = None
-    """Values that a feature can take, equidistant in [-1, 1]; None leaves features continuous."""
 
     def setup(self) -> None:
         self.blocks = [nn.Dense(width) for width in self.hidden]
@@ -61,14 +48,13 @@ class VectorEncoder(nn.Module):
         return nn.relu(self.blocks[0](x.astype(jnp.float32)))
 
     def finish(self, h: jax.Array) -> jax.Array:
-        """(..., hidden[0]) -> (..., features): all that follows the first block, before any rounding."""
+        """(..., hidden[0]) -> (..., features): all that follows the first block."""
         for block in self.blocks[1:]:
             h = nn.relu(block(h))
         return self.output(h)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        z = self.finish(self.first_block(x))
-        return z if self.levels is None else quantize(z, self.levels)
+        return self.finish(self.first_block(x))
 
 
 class ImageEncoder(nn.Module):
@@ -76,8 +62,6 @@ class ImageEncoder(nn.Module):
 
     plan: tuple[ConvBlock, ...]
     features: int
-    levels: int | None = None
-    """Values that a feature can take, equidistant in [-1, 1]; None leaves features continuous."""
 
     def setup(self) -> None:
         self.blocks = [
@@ -95,14 +79,13 @@ class ImageEncoder(nn.Module):
         return self._block(0, x.astype(jnp.float32))
 
     def finish(self, h: jax.Array) -> jax.Array:
-        """(..., rows', columns', channels') -> (..., features): all that follows the first block, before any rounding."""
+        """(..., rows', columns', channels') -> (..., features): all that follows the first block."""
         for index in range(1, len(self.plan)):
             h = self._block(index, h)
         return self.output(h.reshape(*h.shape[:-3], -1))
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        z = self.finish(self.first_block(x))
-        return z if self.levels is None else quantize(z, self.levels)
+        return self.finish(self.first_block(x))
 
 
 Encoder = VectorEncoder | ImageEncoder
@@ -130,10 +113,10 @@ def _fits(plan: Sequence[ConvBlock], size: int) -> bool:
     return size >= 1
 
 
-def encoder_for(spec: ArraySpec, features: int, levels: int | None = None) -> Encoder:
+def encoder_for(spec: ArraySpec, features: int) -> Encoder:
     """The encoder of arrays like `spec`: vectors (D,) or images (rows, columns, channels)."""
     if spec.is_image:
-        return ImageEncoder(plan=image_plan(min(spec.shape[:2])), features=features, levels=levels)
+        return ImageEncoder(plan=image_plan(min(spec.shape[:2])), features=features)
     if len(spec.shape) == 1:
-        return VectorEncoder(hidden=VECTOR_HIDDEN, features=features, levels=levels)
+        return VectorEncoder(hidden=VECTOR_HIDDEN, features=features)
     raise ValueError(f"no encoder for arrays of shape {spec.shape}: vectors (D,) and images (rows, columns, channels)")

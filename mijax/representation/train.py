@@ -25,6 +25,7 @@ from mijax.representation.dataset import Transitions, TransitionTable, collect, 
 from mijax.representation.model import Networks, init_parameters, local_features, networks_for
 from mijax.types import Metrics, Params, Representation
 
+ENCODER_NETWORKS = ("phi", "psi", "dynamics", "discriminator_s", "discriminator_o")
 STANDARDIZE_FLOOR = 1e-6
 """Added to the variance of a feature before dividing by it, as a fraction of the mean variance of all features."""
 ProgressCallback = Callable[[int, dict[str, float]], None]
@@ -101,8 +102,39 @@ class Problem:
 
 
 def optimizers(config: Stage1Config, updates: int) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Adam for the encoders, whose step size falls linearly to 0, and Adam at a constant one for the estimator."""
-    return optax.adam(optax.linear_schedule(config.learning_rate, 0.0, updates)), optax.adam(config.learning_rate)
+    """Adam for the encoders and the dynamics model, its step size falling to 0 as a half cosine, with the shrinkage of
+    phi; and Adam at a constant step size for the estimator, which has to follow to the end.
+    """
+    step_size = optax.cosine_decay_schedule(config.learning_rate, updates)
+    plain = optax.adam(step_size)
+    names = {name: "phi" if name == "phi" else "others" for name in ENCODER_NETWORKS}
+    optimizer = optax.partition({"phi": optax.chain(plain, shrink(config.phi_shrinkage, step_size)), "others": plain}, names)
+    return optimizer, optax.adam(config.learning_rate)
+
+
+def shrink(strength: float, step_size: optax.Schedule) -> optax.GradientTransformation:
+    """Pull every weight (not the biases) towards 0 by `strength` x step size after each update, and stop it there.
+
+    The proximal step of an L1 penalty, decoupled from Adam's normalisation as weight decay is in AdamW: a weight
+    survives only if its gradient, in units of its own root mean square, keeps asking for it with more than `strength`.
+    """
+
+    def init(parameters: optax.Params) -> jax.Array:
+        del parameters
+        return jnp.zeros((), jnp.int32)
+
+    def update(updates: optax.Updates, count: jax.Array, parameters: optax.Params | None = None) -> tuple:
+        threshold = strength * step_size(count)
+
+        def pull(update: jax.Array, weight: jax.Array) -> jax.Array:
+            if weight.ndim < 2:
+                return update
+            moved = weight + update
+            return jnp.sign(moved) * jnp.maximum(jnp.abs(moved) - threshold, 0.0) - weight
+
+        return jax.tree.map(pull, updates, parameters), count + 1
+
+    return optax.GradientTransformation(init, update)
 
 
 def encode(

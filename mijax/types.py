@@ -1,6 +1,6 @@
 """Named frozen pytrees that pass between the rooms of the library. A shape comment stands on every field.
 
-Letters: E environments, R packed rows, L tokens per row, A actions, F features.
+Letters: E environments, R packed rows, L tokens per row, N frames, A actions, F features.
 """
 
 from typing import Any
@@ -31,7 +31,8 @@ class Tokens:
     Token t of an episode is what was known on arriving at step t: (a_{t-1}, o_t). Padding belongs to segment 0.
     """
 
-    observation: jax.Array  # (R, L, *observation_shape)
+    frames: jax.Array  # (N, *observation_shape)  the observations to encode: one a token, or the distinct ones
+    frame: jax.Array | None  # (R, L) int32, which frame a token shows; None when frames are the tokens in order
     previous_action: jax.Array  # (R, L) int32; -1 on the first token of an episode
     reward: jax.Array  # (R, L) float32, received on arriving
     terminated: jax.Array  # (R, L) bool, on arriving

@@ -1,0 +1,154 @@
+"""The jitted loop: environment steps and gradient updates in a static schedule.
+
+`init(key)` makes the whole state of one seed and `run_chunk(state)` advances it by a fixed number of iterations. One
+iteration is always the same work: K steps in each of E environments, then updates_per_step * E * K updates. Seeds,
+devices, checkpoints and logging are wrapped around these two functions.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_mjx.base import Environment
+from mijax.agents.dqn import DQN, AgentState, make_agent
+from mijax.config import Config
+from mijax.nets.encoders import encoder_for
+from mijax.packing import first_fit, gather_rows, one_per_row, row_choices
+from mijax.replay import Replay, init_replay, sample_episodes, write
+from mijax.rollout import Episodes, EpisodeTotals, Labeller, collect_step, evaluate, record_of, start_episodes
+from mijax.types import Metrics, Representation
+
+
+@struct.dataclass
+class LearnerState:
+    """Everything of one seed: saved and restored, it continues bit for bit."""
+
+    agent: AgentState
+    representation: Representation | None
+    episodes: Episodes
+    replay: Replay
+    key: jax.Array  # typed PRNG key; every iteration folds its number into it
+    iteration: jax.Array  # () int32
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """One agent on one environment."""
+
+    env: Environment
+    config: Config
+    agent: DQN
+    pack: bool = True  # choose the number of packed rows at run time; a branch that `vmap` would turn into all of them
+
+    def init(self, key: jax.Array, representation: Representation | None) -> LearnerState:
+        """Fresh networks and a replay warmed up by random episodes."""
+        key_agent, key_start, key_warmup, key_run = jax.random.split(key, 4)
+        num_envs = self.config.num_envs
+        episodes = start_episodes(self.env, self.agent, num_envs, key_start)
+        first = record_of(episodes.timestep, episodes.previous_action, self._labeller(representation))
+        capacity = max(num_envs, self.config.dqn.replay_steps // self.env.horizon)
+        replay = init_replay(first, capacity, self.env.horizon)
+        state = LearnerState(
+            agent=self.agent.init(key_agent, representation),
+            representation=representation,
+            episodes=episodes,
+            replay=write(replay, first, episodes.position),
+            key=key_run,
+            iteration=jnp.zeros((), jnp.int32),
+        )
+        state, _ = self._collect(state, jnp.ones(()), self.warmup_steps // num_envs, key_warmup)
+        return state
+
+    @property
+    def warmup_steps(self) -> int:
+        """Random environment steps before the first update: at least `warmup_episodes` full-length episodes."""
+        rounds = -(-self.config.dqn.warmup_episodes // self.config.num_envs)
+        return rounds * self.config.num_envs * self.env.horizon
+
+    @property
+    def iterations_per_chunk(self) -> int:
+        """Iterations between two evaluations."""
+        return self.config.evaluation.every // self.config.iteration_steps
+
+    def environment_steps(self, state: LearnerState) -> jax.Array:
+        """() int32: environment steps so far, the warm-up included."""
+        return self.warmup_steps + state.iteration * self.config.iteration_steps
+
+    def epsilon(self, environment_steps: jax.Array) -> jax.Array:
+        """() exploration after so many steps."""
+        dqn = self.config.dqn
+        progress = jnp.minimum(environment_steps / dqn.epsilon_steps, 1)
+        return 1 + (dqn.epsilon_final - 1) * progress
+
+    def run_chunk(self, state: LearnerState, iterations: int | None = None) -> tuple[LearnerState, Metrics]:
+        """Advance by `iterations` (default: up to the next evaluation); metrics are means over the chunk."""
+
+        def iterate(state: LearnerState, _: None) -> tuple[LearnerState, tuple[EpisodeTotals, Metrics]]:
+            key_collect, key_update = jax.random.split(jax.random.fold_in(state.key, state.iteration))
+            epsilon = self.epsilon(self.environment_steps(state))
+            state, totals = self._collect(state, epsilon, self.config.steps_per_iteration, key_collect)
+            state, metrics = self._learn(state, key_update)
+            return state.replace(iteration=state.iteration + 1), (totals, metrics)
+
+        state, (totals, losses) = jax.lax.scan(iterate, state, None, iterations or self.iterations_per_chunk)
+        totals = jax.tree.map(lambda x: jnp.sum(x, axis=0), totals)
+        metrics = jax.tree.map(jnp.mean, losses) | totals.metrics()
+        return state, metrics | {"train/epsilon": self.epsilon(self.environment_steps(state))}
+
+    def evaluate(self, state: LearnerState, key: jax.Array, num_episodes: int) -> Metrics:
+        """Greedy episodes of the averaged network: per-episode results, each (num_episodes,)."""
+        return evaluate(self.env, self.agent, state.agent.target, num_episodes, key)
+
+    def _labeller(self, representation: Representation | None) -> Labeller:
+        if representation is None:
+            return None
+        phi = encoder_for(self.env.state_spec, self.config.stage1.features)
+        return lambda states: phi.apply({"params": representation.phi}, states)
+
+    def _collect(
+        self, state: LearnerState, epsilon: jax.Array, steps: int, key: jax.Array
+    ) -> tuple[LearnerState, EpisodeTotals]:
+        label = self._labeller(state.representation)
+        params = state.agent.params["agent"]
+
+        def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+            return collect_step(self.env, self.agent, params, label, epsilon, *carry, key), None
+
+        carry = (state.episodes, state.replay, EpisodeTotals.zero())
+        (episodes, replay, totals), _ = jax.lax.scan(step, carry, jax.random.split(key, steps))
+        return state.replace(episodes=episodes, replay=replay), totals
+
+    def _learn(self, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Metrics]:
+        def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, Metrics]:
+            return self.update(agent, state.replay, state.representation, key)
+
+        agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, self.config.updates_per_iteration))
+        return state.replace(agent=agent), jax.tree.map(jnp.mean, metrics)
+
+    def update(
+        self, agent: AgentState, replay: Replay, representation: Representation | None, key: jax.Array
+    ) -> tuple[AgentState, Metrics]:
+        """One gradient update on a batch of episodes, packed into as few rows as they need."""
+        batch = self.config.dqn.batch_episodes
+        max_frames = self.env.max_distinct_observations(batch)
+        key_sample, key_loss = jax.random.split(key)
+        slots = sample_episodes(replay, key_sample, batch)
+        choices = row_choices(batch) if self.pack else (batch,)
+        row_length = replay.data.reward.shape[1]
+        layout = first_fit(replay.length[slots], row_length) if self.pack else one_per_row(batch)
+
+        def with_rows(rows: int) -> tuple[AgentState, Metrics]:
+            tokens = gather_rows(replay, slots, layout, rows, max_frames)
+            return self.agent.update(agent, tokens, representation, key_loss)
+
+        if len(choices) == 1:
+            return with_rows(batch)
+        branch = jnp.searchsorted(jnp.asarray(choices), layout.num_rows)
+        return jax.lax.switch(branch, [lambda rows=rows: with_rows(rows) for rows in choices])
+
+
+def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:
+    """The learner that a configuration describes."""
+    return Learner(env, config, make_agent(env, config), pack)

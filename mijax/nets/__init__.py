@@ -1,0 +1,1 @@
+"""Flax modules and nothing else: sequence memories, encoders, heads and the two-branch agent."""

@@ -1,0 +1,133 @@
+"""The two-branch agent and the information model f (paper Fig. 1)."""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_mjx.base import ArraySpec
+from mijax.config import MemoryName, NetworkConfig
+from mijax.nets.encoders import encoder_for
+from mijax.nets.gpt import GPT
+from mijax.nets.gru import GRU
+from mijax.nets.heads import MLP, ActionEmbedder, ObservationEmbedder
+from mijax.types import Tokens
+
+
+@struct.dataclass
+class MemoryState:
+    """What an agent carries through an episode while acting."""
+
+    position: jax.Array  # (B,) int32, tokens seen so far
+    recurrent: Any  # keys and values of the GPT, or the hidden state of the GRU
+
+
+def frame_features(features: jax.Array, tokens: Tokens) -> jax.Array:
+    """Hand encoded frames (N, F) to the tokens that show them: (R L, F)."""
+    return features if tokens.frame is None else features[tokens.frame.reshape(-1)]
+
+
+class HistoryEncoder(nn.Module):
+    """The memory branch: embedded previous action and observation, then a sequence model."""
+
+    num_actions: int
+    max_length: int
+    memory: MemoryName
+    network: NetworkConfig
+
+    def setup(self) -> None:
+        net, dtype = self.network, jnp.dtype(self.network.dtype)
+        self.embed_action = ActionEmbedder(self.num_actions, net.action_embedding, dtype)
+        self.embed_observation = ObservationEmbedder(net.observation_embedding, dtype)
+        if self.memory == "gpt":
+            width = net.action_embedding + net.observation_embedding
+            self.sequence = GPT(width, self.max_length, net.layers, net.heads, net.dropout, dtype)
+        else:
+            self.sequence = GRU(net.gru_width, dtype)
+
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> jax.Array:
+        """(R L, W) a summary of the history at every token."""
+        observation = frame_features(self.embed_observation(tokens.frames), tokens)
+        x = jnp.concatenate([self.embed_action(tokens.previous_action.reshape(-1)), observation], axis=-1)
+        return self.sequence(x, tokens.segment, tokens.position, deterministic)
+
+    def initial_state(self, batch: int) -> MemoryState:
+        """The memory of `batch` episodes that have not started."""
+        return MemoryState(jnp.zeros((batch,), jnp.int32), self.sequence.initial_state(batch))
+
+    def step(
+        self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
+    ) -> tuple[MemoryState, jax.Array]:
+        """One token for each of (B,) episodes -> new memory, (B, W) history summaries."""
+        x = jnp.concatenate([self.embed_action(previous_action), self.embed_observation(observation)], axis=-1)
+        recurrent, summary = self.sequence.step(state.recurrent, x, state.position)
+        return MemoryState(state.position + 1, recurrent), summary
+
+
+class TwoBranchQ(nn.Module):
+    """Q(h, a) from a memory branch over the history and a memoryless branch over the observation."""
+
+    observation_spec: ArraySpec
+    num_actions: int
+    max_length: int
+    memory: MemoryName
+    network: NetworkConfig
+    features: int
+    bottom_psi: bool  # the memoryless branch has psi's architecture, so that it can start from it
+    predicts_state: bool  # the memory branch has a head that predicts z_s (the auxiliary task)
+
+    def setup(self) -> None:
+        net, dtype = self.network, jnp.dtype(self.network.dtype)
+        self.top = HistoryEncoder(self.num_actions, self.max_length, self.memory, net)
+        if self.bottom_psi:
+            self.bottom = encoder_for(self.observation_spec, self.features)
+        else:
+            width = 100 if self.observation_spec.is_image else 128
+            self.bottom = ObservationEmbedder(width, dtype)
+        self.q_head = MLP(net.critic_hidden, self.num_actions, dtype)
+        if self.predicts_state:
+            self.state_head = MLP(net.auxiliary_hidden, self.features, dtype)
+
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> tuple[jax.Array, jax.Array | None]:
+        """(R, L, A) action values and, with the auxiliary task, (R, L, F) the predicted z_s."""
+        summary = self.top(tokens, deterministic)
+        z_o = frame_features(self.bottom(tokens.frames), tokens)
+        shape = tokens.segment.shape
+        q = self.q_head(jnp.concatenate([summary, z_o.astype(summary.dtype)], axis=-1)).astype(jnp.float32)
+        predicted = None
+        if self.predicts_state:
+            predicted = self.state_head(summary).astype(jnp.float32).reshape(*shape, self.features)
+        return q.reshape(*shape, self.num_actions), predicted
+
+    def initial_state(self, batch: int) -> MemoryState:
+        """The memory of `batch` episodes that have not started."""
+        return self.top.initial_state(batch)
+
+    def step(
+        self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
+    ) -> tuple[MemoryState, jax.Array]:
+        """One token for each of (B,) episodes -> new memory, (B, A) action values."""
+        state, summary = self.top.step(state, observation, previous_action)
+        z_o = self.bottom(observation).astype(summary.dtype)
+        return state, self.q_head(jnp.concatenate([summary, z_o], axis=-1)).astype(jnp.float32)
+
+
+class InformationModel(nn.Module):
+    """f(h): the mean of a Gaussian over z_s given the history (paper Eq. 4, 5). A network of its own."""
+
+    num_actions: int
+    max_length: int
+    memory: MemoryName
+    network: NetworkConfig
+    features: int
+
+    def setup(self) -> None:
+        self.history = HistoryEncoder(self.num_actions, self.max_length, self.memory, self.network)
+        self.head = MLP(self.network.auxiliary_hidden, self.features, jnp.dtype(self.network.dtype))
+
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> jax.Array:
+        """(R, L, F) the expected z_s at every token."""
+        expected = self.head(self.history(tokens, deterministic)).astype(jnp.float32)
+        return expected.reshape(*tokens.segment.shape, self.features)

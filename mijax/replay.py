@@ -1,0 +1,81 @@
+"""A replay of whole episodes that lives on the device and is written in place.
+
+Every environment owns one open slot and writes each step into it as it happens; when the episode ends its slot joins
+the finished ones and the environment is given another. So an episode is never copied, only finished episodes can be
+sampled, and the oldest finished one is overwritten first.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@struct.dataclass
+class StepRecord:
+    """What is stored of one step, for a token (a_{t-1}, o_t) and the transition that led to it."""
+
+    observation: jax.Array  # (E, *observation_shape) in the environment's own dtype
+    previous_action: jax.Array  # (E,) int32; -1 on the first step of an episode
+    reward: jax.Array  # (E,) float32, received on arriving
+    terminated: jax.Array  # (E,) bool, on arriving
+    truncated: jax.Array  # (E,) bool, on arriving
+    z_s: jax.Array | None  # (E, F) phi(s_t), labelled once on collection; None when the agent does not use it
+
+
+@struct.dataclass
+class Replay:
+    """S = capacity + E slots of L = horizon + 1 steps."""
+
+    data: StepRecord  # every field (S, L, ...)
+    length: jax.Array  # (S,) int32, steps stored in a finished slot, the first observation included
+    finished: jax.Array  # (capacity,) int32, slots of finished episodes, a ring in order of completion
+    open_slots: jax.Array  # (E,) int32, the slot each environment is writing
+    count: jax.Array  # () int32, episodes ever finished
+
+    @property
+    def capacity(self) -> int:
+        """How many finished episodes are kept."""
+        return self.finished.shape[0]
+
+
+def init_replay(example: StepRecord, capacity: int, horizon: int) -> Replay:
+    """An empty replay for records shaped like `example`, whose leading axis is the environments'."""
+    num_envs = example.reward.shape[0]
+    slots = capacity + num_envs
+    data = jax.tree.map(lambda x: jnp.zeros((slots, horizon + 1, *x.shape[1:]), x.dtype), example)
+    return Replay(
+        data=data,
+        length=jnp.zeros((slots,), jnp.int32),
+        finished=jnp.zeros((capacity,), jnp.int32),
+        open_slots=jnp.arange(num_envs, dtype=jnp.int32),
+        count=jnp.zeros((), jnp.int32),
+    )
+
+
+def write(replay: Replay, record: StepRecord, position: jax.Array, keep: jax.Array | bool = True) -> Replay:
+    """Store one step of every environment at (E,) `position` of its open episode, where `keep`."""
+    slots = jnp.where(keep, replay.open_slots, replay.length.shape[0])
+    data = jax.tree.map(lambda x, y: x.at[slots, position].set(y.astype(x.dtype), mode="drop"), replay.data, record)
+    return replay.replace(data=data)
+
+
+def finish(replay: Replay, done: jax.Array, length: jax.Array) -> Replay:
+    """Close the episodes of (E,) `done` environments, each (E,) `length` steps long, and open new slots for them."""
+    num_envs = done.shape[0]
+    order = replay.count + jnp.cumsum(done) - done
+    ring = order % replay.capacity
+    oldest = replay.finished[ring]
+    fresh = jnp.where(order < replay.capacity, num_envs + order, oldest).astype(jnp.int32)
+    closed = jnp.where(done, replay.open_slots, replay.length.shape[0])
+    return replay.replace(
+        length=replay.length.at[closed].set(length, mode="drop"),
+        finished=replay.finished.at[jnp.where(done, ring, replay.capacity)].set(replay.open_slots, mode="drop"),
+        open_slots=jnp.where(done, fresh, replay.open_slots),
+        count=replay.count + jnp.sum(done, dtype=jnp.int32),
+    )
+
+
+def sample_episodes(replay: Replay, key: jax.Array, batch: int) -> jax.Array:
+    """(batch,) int32 slots of finished episodes, uniform with replacement whatever their length."""
+    number = jnp.minimum(replay.count, replay.capacity)
+    return replay.finished[jax.random.randint(key, (batch,), 0, number)]

@@ -28,6 +28,8 @@ from mijax.types import Metrics, Params, Representation
 ENCODER_NETWORKS = ("phi", "psi", "dynamics", "discriminator_s", "discriminator_o")
 STANDARDIZE_FLOOR = 1e-6
 """Added to the variance of a feature before dividing by it, as a fraction of the mean variance of all features."""
+FrameFunction = Callable[[jax.Array], jax.Array]
+"""(M, ...) frames -> (M, F)."""
 ProgressCallback = Callable[[int, dict[str, float]], None]
 """Called after each epoch with its number, from 1, and the metrics of its last batch."""
 
@@ -37,13 +39,32 @@ class DivergenceError(RuntimeError):
 
 
 @struct.dataclass
+class EstimatorState:
+    """CLUB's q(z_o | z_s)."""
+
+    parameters: Params
+    optimizer: optax.OptState
+
+
+@struct.dataclass
+class Features:
+    """Of the B rows of a batch."""
+
+    z_s: jax.Array  # (B, F)
+    z_o: jax.Array  # (B, F)
+    next_z_s: jax.Array  # (B, F)  constant
+    next_z_o: jax.Array  # (B, F)  constant
+    local_s: jax.Array | None  # (B, F)  the discriminator's features of s (Fig. 28); None when its weight is 0
+    local_o: jax.Array | None  # (B, F)  the same of o
+
+
+@struct.dataclass
 class TrainState:
     """All that changes in training."""
 
     parameters: dict[str, Params]  # phi, psi, dynamics, discriminator_s, discriminator_o
-    estimator: Params  # CLUB's q(z_o | z_s)
     optimizer: optax.OptState
-    estimator_optimizer: optax.OptState
+    estimator: EstimatorState
 
 
 @struct.dataclass
@@ -137,15 +158,24 @@ def shrink(strength: float, step_size: optax.Schedule) -> optax.GradientTransfor
     return optax.GradientTransformation(init, update)
 
 
-def encode(
-    encoder: Encoder, parameters: Params, frames: jax.Array, index: jax.Array, next_index: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Features (B, F) of the frames at `index`, and constant ones of those at `next_index`, both (B,) int32."""
-    if frames.shape[0] <= index.shape[0]:
-        z = encoder.apply({"params": parameters}, frames)
-        return z[index], jax.lax.stop_gradient(z)[next_index]
-    z = encoder.apply({"params": parameters}, frames[index])
-    return z, jax.lax.stop_gradient(encoder.apply({"params": parameters}, frames[next_index]))
+def encode(function: FrameFunction, frames: jax.Array, index: jax.Array) -> jax.Array:
+    """function(frames[index]), (B, F), for (B,) `index`, computed on as few frames as can be.
+
+    All distinct frames of the data are encoded when there are no more of them than rows. Otherwise the distinct ones of
+    this batch, when they fill at most a quarter of the data's or, for a data set of mostly different frames, all rows.
+    """
+    count, capacity = frames.shape[0], frames.shape[0] // 4
+    if count <= index.shape[0]:
+        return function(frames)[index]
+    if capacity >= index.shape[0]:
+        return function(frames[index])
+    present = jnp.zeros(count, jnp.int32).at[index].set(1)
+    slot = jnp.cumsum(present) - 1
+
+    def of_distinct() -> jax.Array:
+        return function(frames[jnp.nonzero(present, size=capacity, fill_value=0)[0]])[slot[index]]
+
+    return jax.lax.cond(slot[-1] < capacity, of_distinct, lambda: function(frames[index]))
 
 
 def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
@@ -158,67 +188,80 @@ def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
     return centered * jax.lax.rsqrt(variance + STANDARDIZE_FLOOR * jnp.mean(variance) + 1e-12)[None]
 
 
-def dim_loss(
-    encoder: Encoder, parameters: Params, discriminator: Params, frames: jax.Array, index: jax.Array, z: jax.Array,
-    weight: jax.Array
-) -> jax.Array:
-    """L_DIM (Eq. 8) of the features z (B, F) of the frames at (B,) `index`."""
-    if frames.shape[0] <= index.shape[0]:
-        local = local_features(encoder, parameters, discriminator, frames)[index]
-    else:
-        local = local_features(encoder, parameters, discriminator, frames[index])
+def features(problem: Problem, parameters: dict[str, Params], rows: TransitionTable) -> Features:
+    """z_s, z_o, their successors (constants), and what the discriminators say of the inputs: (B, F) each."""
+    networks, data, config = problem.networks, problem.data, problem.config
+
+    def both(encoder: Encoder, frames: jax.Array, index: jax.Array, next_index: jax.Array, name: str,
+             discriminator: str | None) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+        weights = parameters[name]
+        frozen = jax.lax.stop_gradient(weights)
+
+        def now(x: jax.Array) -> jax.Array:
+            z = encoder.apply({"params": weights}, x)
+            if discriminator is None:
+                return z
+            return jnp.concatenate([z, local_features(encoder, weights, parameters[discriminator], x)], axis=-1)
+
+        z, *local = jnp.split(encode(now, frames, index), 1 if discriminator is None else 2, axis=-1)
+        return z, encode(lambda x: encoder.apply({"params": frozen}, x), frames, next_index), local[0] if local else None
+
+    z_s, next_z_s, local_s = both(networks.phi, data.states, rows.state, rows.next_state, "phi",
+                                  "discriminator_s" if config.lambda_dim_s > 0 else None)
+    z_o, next_z_o, local_o = both(networks.psi, data.observations, rows.observation, rows.next_observation, "psi",
+                                  "discriminator_o" if config.lambda_dim_o > 0 else None)
+    return Features(z_s=z_s, z_o=z_o, next_z_s=next_z_s, next_z_o=next_z_o, local_s=local_s, local_o=local_o)
+
+
+def dim_loss(z: jax.Array, local: jax.Array, index: jax.Array, weight: jax.Array) -> jax.Array:
+    """L_DIM (Eq. 8) of features and discriminator outputs (B, F) of the frames at (B,) `index`."""
     return dim_jensen_shannon(z @ local.T, index[:, None] == index[None, :], weight)[0]
 
 
 def encoder_loss(
-    parameters: dict[str, Params], estimator: Params, problem: Problem, batch: Batch
-) -> tuple[jax.Array, Metrics]:
-    """The weighted sum of Algorithm 1, line 8, and its terms."""
-    config, networks, data = problem.config, problem.networks, problem.data
-    rows, weight = batch.rows, batch.weight
-    z_s, next_z_s = encode(networks.phi, parameters["phi"], data.states, rows.state, rows.next_state)
-    z_o, next_z_o = encode(
-        networks.psi, parameters["psi"], data.observations, rows.observation, rows.next_observation)
+    parameters: dict[str, Params], fit: EstimatorState, problem: Problem, batch: Batch,
+    optimizer: optax.GradientTransformation
+) -> tuple[jax.Array, tuple[EstimatorState, Metrics]]:
+    """The weighted sum of Algorithm 1, line 8, with CLUB's estimator first fitted to the current features.
+
+    Returns:
+        The loss, and the estimator with the terms of the loss.
+    """
+    config, networks, rows, weight = problem.config, problem.networks, batch.rows, batch.weight
+    f = features(problem, parameters, rows)
+    fit = fit_estimator(fit, problem, batch, f.z_s, f.z_o, optimizer)
     reward, predicted_z_s, predicted_z_o = networks.dynamics.apply(
-        {"params": parameters["dynamics"]}, z_s, z_o, networks.encode_action(rows.action))
-    mean, log_variance = networks.estimator.apply({"params": estimator}, standardize(z_s, weight))
+        {"params": parameters["dynamics"]}, f.z_s, f.z_o, networks.encode_action(rows.action))
+    mean, log_variance = networks.estimator.apply({"params": fit.parameters}, standardize(f.z_s, weight))
     terms = {
         "reward_loss": (config.lambda_r, reward_loss(reward, rows.reward, weight)[0]),
-        "z_s_loss": (config.lambda_s, next_feature_loss(predicted_z_s, next_z_s, rows.terminal, weight)[0]),
-        "z_o_loss": (config.lambda_o, next_feature_loss(predicted_z_o, next_z_o, rows.terminal, weight)[0]),
-        "club": (config.lambda_club, club_all_pairs(standardize(z_o, weight), mean, log_variance, weight)[0]),
+        "z_s_loss": (config.lambda_s, next_feature_loss(predicted_z_s, f.next_z_s, rows.terminal, weight)[0]),
+        "z_o_loss": (config.lambda_o, next_feature_loss(predicted_z_o, f.next_z_o, rows.terminal, weight)[0]),
+        "club": (config.lambda_club, club_all_pairs(standardize(f.z_o, weight), mean, log_variance, weight)[0]),
     }
-    if config.lambda_dim_s > 0:
-        terms["dim_s_loss"] = config.lambda_dim_s, dim_loss(
-            networks.phi, parameters["phi"], parameters["discriminator_s"], data.states, rows.state, z_s, weight)
-    if config.lambda_dim_o > 0:
-        terms["dim_o_loss"] = config.lambda_dim_o, dim_loss(
-            networks.psi, parameters["psi"], parameters["discriminator_o"], data.observations, rows.observation, z_o,
-            weight)
+    if f.local_s is not None:
+        terms["dim_s_loss"] = config.lambda_dim_s, dim_loss(f.z_s, f.local_s, rows.state, weight)
+    if f.local_o is not None:
+        terms["dim_o_loss"] = config.lambda_dim_o, dim_loss(f.z_o, f.local_o, rows.observation, weight)
     total = sum((scale * value for scale, value in terms.values()), jnp.zeros((), jnp.float32))
-    return total, {"loss": total} | {name: value for name, (_, value) in terms.items()}
+    return total, (fit, {"loss": total} | {name: value for name, (_, value) in terms.items()})
 
 
 def fit_estimator(
-    estimator: Params, state: optax.OptState, problem: Problem, parameters: dict[str, Params], batch: Batch,
+    fit: EstimatorState, problem: Problem, batch: Batch, z_s: jax.Array, z_o: jax.Array,
     optimizer: optax.GradientTransformation
-) -> tuple[Params, optax.OptState]:
-    """Move q(z_o | z_s) towards the current features, `estimator_updates` times on this batch."""
-    networks, data, rows = problem.networks, problem.data, batch.rows
-    z_s, _ = encode(networks.phi, parameters["phi"], data.states, rows.state, rows.next_state)
-    z_o, _ = encode(networks.psi, parameters["psi"], data.observations, rows.observation, rows.next_observation)
-    z_s, z_o = standardize(z_s, batch.weight), standardize(z_o, batch.weight)
+) -> EstimatorState:
+    """Move q(z_o | z_s) towards the current features, which stay constant, `estimator_updates` times on this batch."""
+    z_s, z_o = (jax.lax.stop_gradient(standardize(z, batch.weight)) for z in (z_s, z_o))
 
-    def loss(estimator: Params) -> jax.Array:
-        return gaussian_fit(z_o, *networks.estimator.apply({"params": estimator}, z_s), batch.weight)[0]
+    def loss(parameters: Params) -> jax.Array:
+        return gaussian_fit(z_o, *problem.networks.estimator.apply({"params": parameters}, z_s), batch.weight)[0]
 
-    def update(carry: tuple, _: None) -> tuple[tuple, None]:
-        estimator, state = carry
-        step, state = optimizer.update(jax.grad(loss)(estimator), state)
-        return (optax.apply_updates(estimator, step), state), None
+    def update(fit: EstimatorState, _: None) -> tuple[EstimatorState, None]:
+        step, optimizer_state = optimizer.update(jax.grad(loss)(fit.parameters), fit.optimizer)
+        return EstimatorState(optax.apply_updates(fit.parameters, step), optimizer_state), None
 
-    (estimator, state), _ = jax.lax.scan(update, (estimator, state), None, length=problem.config.estimator_updates)
-    return estimator, state
+    return jax.lax.scan(update, fit, None, length=problem.config.estimator_updates)[0]
 
 
 def initial_state(problem: Problem, key: jax.Array) -> TrainState:
@@ -226,7 +269,8 @@ def initial_state(problem: Problem, key: jax.Array) -> TrainState:
     parameters = init_parameters(problem.networks, key, problem.data.states[:1], problem.data.observations[:1])
     estimator = parameters.pop("estimator")
     optimizer, estimator_optimizer = optimizers(problem.config, 1)
-    return TrainState(parameters, estimator, optimizer.init(parameters), estimator_optimizer.init(estimator))
+    return TrainState(
+        parameters, optimizer.init(parameters), EstimatorState(estimator, estimator_optimizer.init(estimator)))
 
 
 def make_epoch(problem: Problem) -> Callable[[TrainState, jax.Array], tuple[TrainState, Metrics]]:
@@ -236,13 +280,10 @@ def make_epoch(problem: Problem) -> Callable[[TrainState, jax.Array], tuple[Trai
     optimizer, estimator_optimizer = optimizers(config, config.epochs * updates)
 
     def update(state: TrainState, chosen: jax.Array) -> tuple[TrainState, Metrics]:
-        batch = problem.batch(chosen)
-        estimator, estimator_state = fit_estimator(
-            state.estimator, state.estimator_optimizer, problem, state.parameters, batch, estimator_optimizer)
-        gradients, metrics = jax.grad(encoder_loss, has_aux=True)(state.parameters, estimator, problem, batch)
+        gradients, (fit, metrics) = jax.grad(encoder_loss, has_aux=True)(
+            state.parameters, state.estimator, problem, problem.batch(chosen), estimator_optimizer)
         step, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
-        parameters = optax.apply_updates(state.parameters, step)
-        return TrainState(parameters, estimator, optimizer_state, estimator_state), metrics
+        return TrainState(optax.apply_updates(state.parameters, step), optimizer_state, fit), metrics
 
     @jax.jit
     def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
@@ -288,7 +329,7 @@ def train_on(
             on_progress(number, seen[-1])
     history = History(
         metrics={name: np.array([m[name] for m in seen]) for name in seen[-1]},
-        dynamics=state.parameters["dynamics"], estimator=state.estimator,
+        dynamics=state.parameters["dynamics"], estimator=state.estimator.parameters,
         updates=config.epochs * problem.updates_per_epoch,
         compile_seconds=compiled - started, seconds=time.perf_counter() - compiled)
     return _representation(problem, state), history

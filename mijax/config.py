@@ -1,10 +1,13 @@
 """Every option of a run, as frozen dataclasses. Presets of the six domains are in `configs/`."""
 
 import dataclasses
-from typing import Literal
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
 
 MemoryName = Literal["gpt", "gru"]
 IntrinsicForm = Literal["explained_variance", "cosine"]
+SeedStrategy = Literal["auto", "map", "vmap", "shard"]
 
 
 class ConfigError(ValueError):
@@ -164,6 +167,29 @@ class EvaluationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SeedsConfig:
+    """How several seeds share the machine."""
+
+    strategy: SeedStrategy = "auto"
+    """map: one after the other on one device; vmap: one batched program; shard: spread over the devices. auto: vmap on
+    an accelerator; on a CPU, map for one seed and shard over one host device per core for several."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckpointConfig:
+    """What a run keeps on disk to go on from."""
+
+    every: int = 10
+    """Evaluations between checkpoints."""
+    keep: int = 2
+    """Checkpoints kept, the newest."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("checkpoint.", self, 1, "every")
+        _require_at_least("checkpoint.", self, 2, "keep")
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """A whole run."""
 
@@ -184,14 +210,17 @@ class Config:
     dqn: DQNConfig = dataclasses.field(default_factory=DQNConfig)
     information: InformationConfig = dataclasses.field(default_factory=InformationConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    seeds: SeedsConfig = dataclasses.field(default_factory=SeedsConfig)
+    checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
 
     def __post_init__(self) -> None:
         _require_at_least("", self, 1, "steps", "num_envs", "steps_per_iteration")
-        updates = self.dqn.updates_per_step * self.iteration_steps
-        require(updates >= 1 and abs(updates - round(updates)) < 1e-9, "dqn.updates-per-step", self.dqn.updates_per_step,
-                f"a whole number of updates per iteration of num-envs x steps-per-iteration = {self.iteration_steps} steps")
-        require(self.evaluation.every % self.iteration_steps == 0, "evaluation.every", self.evaluation.every,
-                f"a multiple of num-envs x steps-per-iteration = {self.iteration_steps}")
+        steps = self.iteration_steps
+        updates = self.dqn.updates_per_step * steps
+        require(updates >= 1 and abs(updates - round(updates)) < 1e-9, "dqn.updates-per-step",
+                self.dqn.updates_per_step, f"a whole number of updates in num-envs x steps-per-iteration = {steps} steps")
+        require(self.evaluation.every % steps == 0, "evaluation.every", self.evaluation.every,
+                f"a multiple of num-envs x steps-per-iteration = {steps}")
 
     @property
     def iteration_steps(self) -> int:
@@ -202,3 +231,20 @@ class Config:
     def updates_per_iteration(self) -> int:
         """Gradient updates of one learner iteration."""
         return round(self.dqn.updates_per_step * self.iteration_steps)
+
+
+def config_from_dict(values: Mapping[str, Any]) -> Config:
+    """The configuration that `dataclasses.asdict` once turned into `values`; `ConfigError` for an unknown field."""
+    return _build(Config, values, "")
+
+
+def _build(kind: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    types = typing.get_type_hints(kind)
+    unknown = sorted(set(values) - set(types))
+    require(not unknown, prefix + (unknown[0] if unknown else ""), "a value", f"the options {', '.join(types)}")
+    built = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(types[name]):
+            value = _build(types[name], value, f"{prefix}{name}.")
+        built[name] = tuple(value) if isinstance(value, list) else value
+    return kind(**built)

@@ -97,6 +97,11 @@ class Learner:
         metrics = jax.tree.map(jnp.mean, losses) | totals.metrics()
         return state, metrics | {"train/epsilon": self.epsilon(self.environment_steps(state))}
 
+    def collect_chunk(self, state: LearnerState) -> EpisodeTotals:
+        """The environment steps of one chunk without its updates: what acting and stepping alone cost."""
+        steps = self.iterations_per_chunk * self.config.steps_per_iteration
+        return self._collect(state, self.epsilon(self.environment_steps(state)), steps, state.key)[1]
+
     def evaluate(self, state: LearnerState, key: jax.Array, num_episodes: int) -> Metrics:
         """Greedy episodes of the averaged network: per-episode results, each (num_episodes,)."""
         return evaluate(self.env, self.agent, state.agent.target, num_episodes, key)

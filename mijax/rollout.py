@@ -122,13 +122,15 @@ def collect_step(
 def evaluate(env: Environment, agent: DQN, params: Params, num_episodes: int, key: jax.Array) -> Metrics:
     """Greedy episodes, side by side: per-episode results, each (num_episodes,).
 
-    The discounted return is sum_t gamma^t r_{t+1}.
+    The discounted return is sum_t gamma^t r_{t+1}; `value` is what the agent promises itself of it, and of the bonus,
+    on the first observation: far above the return means that it believes episodes it has learnt by heart.
     """
     discount = agent.config.dqn.discount
     key_start, key_steps = jax.random.split(key)
     episodes = start_episodes(env, agent, num_episodes, key_start)
     false = jnp.zeros((num_episodes,), bool)
     zero = jnp.zeros((num_episodes,))
+    value = agent.value(params, episodes.memory, episodes.timestep.observation, episodes.previous_action)
 
     def advance(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
         episodes, over, success, discounted, revealed = carry
@@ -155,4 +157,5 @@ def evaluate(env: Environment, agent: DQN, params: Params, num_episodes: int, ke
         "success": success.astype(jnp.float32),
         "length": episodes.position.astype(jnp.float32),
         "reveals": revealed.astype(jnp.float32),
+        "value": value,
     }

@@ -1,8 +1,9 @@
 """Double DQN over whole episodes with a two-branch memory agent (paper Section 3.2, Appendix A)."""
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -13,7 +14,7 @@ from mijax.agents.variants import Variant, variant
 from mijax.config import Config, ConfigError
 from mijax.losses import information as info
 from mijax.losses import td
-from mijax.nets.two_branch import InformationModel, MemoryState, TwoBranchQ
+from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, TwoBranchQ
 from mijax.types import Metrics, Params, Representation, Tokens
 
 
@@ -42,7 +43,7 @@ class DQN:
         tokens = _example_tokens(self.network)
         key_agent, key_f = jax.random.split(key)
         agent = self.network.init(key_agent, tokens)["params"]
-        if representation is not None and self.config.information.start_from_psi:
+        if self.declaration.uses_z_s and self.config.information.start_from_psi:
             agent = {**agent, "bottom": representation.psi}
         params = {"agent": agent}
         if self.information_model is not None:
@@ -52,7 +53,7 @@ class DQN:
 
     def initial_memory(self, batch: int) -> MemoryState:
         """What `batch` episodes that have not started remember."""
-        return self.network.apply({}, batch, method=TwoBranchQ.initial_state)
+        return cast(MemoryState, self.network.apply({}, batch, method=TwoBranchQ.initial_state))
 
     def act(
         self, params: Params, memory: MemoryState, observation: jax.Array, previous_action: jax.Array
@@ -68,10 +69,14 @@ class DQN:
         Returns:
             The new memory and (B,) int32 actions.
         """
-        memory, q = self.network.apply(
-            {"params": params}, memory, observation, previous_action, method=TwoBranchQ.step
-        )
+        memory, q = self._step(params, memory, observation, previous_action)
         return memory, jnp.argmax(q, axis=-1).astype(jnp.int32)
+
+    def value(
+        self, params: Params, memory: MemoryState, observation: jax.Array, previous_action: jax.Array
+    ) -> jax.Array:
+        """(B,) max_a Q(h, a) after one more observation; arguments as for `act`."""
+        return jnp.max(self._step(params, memory, observation, previous_action)[1], axis=-1)
 
     def explore(
         self,
@@ -85,7 +90,7 @@ class DQN:
         """As `act`, but each action is uniformly random with probability `epsilon`."""
         memory, greedy = self.act(params, memory, observation, previous_action)
         key_gate, key_action = jax.random.split(key)
-        random = jax.random.randint(key_action, greedy.shape, 0, self.network.num_actions, jnp.int32)
+        random = jax.random.randint(key_action, greedy.shape, 0, self.network.top.num_actions, jnp.int32)
         return memory, jnp.where(jax.random.uniform(key_gate, greedy.shape) < epsilon, random, greedy)
 
     def loss(
@@ -93,25 +98,15 @@ class DQN:
     ) -> tuple[jax.Array, Metrics]:
         """The sum of the TD loss, the weighted auxiliary loss and f's own loss; () and its parts."""
         key_agent, key_f = jax.random.split(key)
-        real = tokens.segment > 0
         q, predicted = self._apply(self.network, params["agent"], tokens, key_agent)
+        q_select = q if self._exact else self.network.apply({"params": params["agent"]}, tokens)[0]
         q_target, _ = self.network.apply({"params": target}, tokens)
-
-        bonus = jnp.zeros_like(tokens.reward)
-        loss, metrics = jnp.zeros(()), {}
+        bonus, loss, metrics = jnp.zeros_like(tokens.reward), jnp.zeros(()), {}
         if self.information_model is not None:
-            f = self._apply(self.information_model, params["f"], tokens, key_f)
-            loss_f, parts_f = info.prediction_mse(f, tokens.z_s, real, representation.z_s_variance)
-            loss_k, parts_k = info.prediction_mse(predicted, tokens.z_s, real, representation.z_s_variance)
-            bonus = self._bonus(jax.lax.stop_gradient(f), tokens.z_s, representation)
-            loss = loss_f + self.config.information.auxiliary_weight * loss_k
-            metrics |= {"loss/f": loss_f, "loss/auxiliary": loss_k,
-                        "f/explained": parts_f["explained"], "auxiliary/explained": parts_k["explained"]}
-
-        loss_td, parts_td, episode_bonus = self._td(q, q_target, bonus, tokens)
-        metrics |= {"loss/td": loss_td, "q/mean": parts_td["q"], "q/error": parts_td["td_error"],
-                    "train/bonus": episode_bonus}
-        return loss + loss_td, metrics
+            chex.assert_not_none(representation)
+            loss, bonus, metrics = self._information(params["f"], predicted, tokens, representation, key_f)
+        loss_td, parts = self._td(q, q_select, q_target, bonus, tokens)
+        return loss + loss_td, metrics | parts
 
     def update(
         self, state: AgentState, tokens: Tokens, representation: Representation | None, key: jax.Array
@@ -125,41 +120,60 @@ class DQN:
         target = optax.incremental_update(params["agent"], state.target, self.config.dqn.target_rate)
         return AgentState(params, target, optimizer, state.updates + 1), metrics
 
-    def _apply(self, module: Any, params: Params, tokens: Tokens, key: jax.Array) -> Any:
-        return module.apply({"params": params}, tokens, self.config.network.dropout == 0, rngs={"dropout": key})
+    def _step(self, params: Params, *arguments: Any) -> tuple[MemoryState, jax.Array]:
+        return cast(Any, self.network.apply({"params": params}, *arguments, method=TwoBranchQ.step))
 
-    def _bonus(self, f: jax.Array, z_s: jax.Array, representation: Representation) -> jax.Array:
-        """(R, L) alpha times the bonus for arriving at each token; meaningless on first tokens, which no target uses."""
-        f_tm1 = jnp.roll(f, 1, axis=1)
-        if self.config.information.intrinsic_form == "cosine":
-            bonus = info.cosine_bonus(z_s, f, f_tm1)
+    @property
+    def _exact(self) -> bool:
+        """Whether gradient passes are free of dropout, so that their outputs serve targets and bonus too."""
+        return self.config.network.dropout == 0
+
+    def _apply(self, module: Any, params: Params, tokens: Tokens, key: jax.Array) -> Any:
+        return module.apply({"params": params}, tokens, self._exact, rngs={"dropout": key})
+
+    def _information(
+        self, params: Params, predicted: Any, tokens: Tokens, representation: Any, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """f's loss plus the weighted auxiliary loss, and (R, L) the weighted bonus for arriving at each token.
+
+        The bonus of an episode's first token is meaningless; no target uses it.
+        """
+        options, variance, z_s = self.config.information, representation.z_s_variance, tokens.z_s
+        real = tokens.segment > 0
+        f = self._apply(self.information_model, params, tokens, key)
+        loss_f, parts_f = info.prediction_mse(f, z_s, real, variance)
+        loss_k, parts_k = info.prediction_mse(predicted, z_s, real, variance)
+        f_t = jax.lax.stop_gradient(f if self._exact else self.information_model.apply({"params": params}, tokens))
+        f_tm1 = jnp.roll(f_t, 1, axis=1)
+        if options.intrinsic_form == "cosine":
+            bonus = info.cosine_bonus(z_s, f_t, f_tm1)
         else:
-            bonus = info.explained_variance_bonus(z_s, f, f_tm1, representation.z_s_variance)
-        return self.config.information.intrinsic_weight * bonus
+            bonus = info.explained_variance_bonus(z_s, f_t, f_tm1, variance)
+        metrics = {"loss/f": loss_f, "loss/auxiliary": loss_k, "f/explained": parts_f["explained"],
+                   "auxiliary/explained": parts_k["explained"]}
+        return loss_f + options.auxiliary_weight * loss_k, options.intrinsic_weight * bonus, metrics
 
     def _td(
-        self, q: jax.Array, q_target: jax.Array, bonus: jax.Array, tokens: Tokens
-    ) -> tuple[jax.Array, Metrics, jax.Array]:
-        """TD loss over the transitions token l -> l + 1 of the same segment, and the mean bonus of an episode."""
+        self, q: jax.Array, q_select: jax.Array, q_target: jax.Array, bonus: jax.Array, tokens: Tokens
+    ) -> tuple[jax.Array, Metrics]:
+        """TD loss over the transitions token l -> l + 1 of the same segment; `q_select` chooses the greedy actions."""
         dqn = self.config.dqn
         valid = (tokens.segment[:, :-1] == tokens.segment[:, 1:]) & (tokens.segment[:, 1:] > 0)
         action = tokens.previous_action[:, 1:]
-        ended = tokens.terminated[:, 1:]
-        if not dqn.bootstrap_at_time_limit:
-            ended |= tokens.truncated[:, 1:]
-        greedy = jnp.argmax(q, axis=-1)[:, :-1] == action
+        ended = tokens.terminated if dqn.bootstrap_at_time_limit else tokens.terminated | tokens.truncated
+        greedy = jnp.argmax(q_select, axis=-1)[:, :-1] == action
         follows = valid & greedy
-        trace = dqn.trace_decay * jnp.pad(follows[:, 1:], ((0, 0), (0, 1)))
+        trace = dqn.trace_decay * jnp.pad(follows[:, 1:].astype(jnp.float32), ((0, 0), (0, 1)))
         target = td.watkins_returns(
             r_t=tokens.reward[:, 1:] + bonus[:, 1:],
-            discount_t=dqn.discount * (1 - ended.astype(jnp.float32)),
-            v_t=td.double_q_value(q[:, 1:], q_target[:, 1:]),
-            trace_t=trace.astype(jnp.float32),
+            discount_t=dqn.discount * (1 - ended[:, 1:].astype(jnp.float32)),
+            v_t=td.double_q_value(q_select[:, 1:], q_target[:, 1:]),
+            trace_t=trace,
         )
         loss, parts = td.td_loss(q[:, :-1], action, target, valid)
         episodes = jnp.sum((tokens.position == 0) & (tokens.segment > 0))
         episode_bonus = jnp.sum(jnp.where(valid, bonus[:, 1:], 0)) / jnp.maximum(episodes, 1)
-        return loss, parts, episode_bonus
+        return loss, {"loss/td": loss, "q/mean": parts["q"], "q/error": parts["td_error"], "train/bonus": episode_bonus}
 
 
 def make_agent(env: Environment, config: Config) -> DQN:
@@ -167,20 +181,11 @@ def make_agent(env: Environment, config: Config) -> DQN:
     if not isinstance(env.action_spec, DiscreteActions):
         raise ConfigError(f"--domain: {env.name} has continuous actions, accepted by this agent: discrete actions")
     declaration = variant(config.agent)
-    common = dict(
-        num_actions=env.action_spec.num,
-        max_length=env.horizon + 1,
-        memory=config.memory,
-        network=config.network,
-        features=config.stage1.features,
-    )
+    history = HistoryEncoder(env.action_spec.num, env.horizon + 1, config.memory, config.network)
     network = TwoBranchQ(
-        observation_spec=env.observation_spec,
-        bottom_psi=declaration.uses_z_s,
-        predicts_state=declaration.uses_z_s,
-        **common,
-    )
-    information_model = InformationModel(**common) if declaration.uses_z_s else None
+        history, env.observation_spec, config.stage1.features, bottom_psi=declaration.uses_z_s,
+        predicts_state=declaration.uses_z_s)
+    information_model = InformationModel(history.clone(), config.stage1.features) if declaration.uses_z_s else None
     dqn = config.dqn
     updates = max(1, round(config.steps * dqn.updates_per_step))
     rate = optax.linear_schedule(dqn.learning_rate, dqn.learning_rate * dqn.final_learning_rate, updates)

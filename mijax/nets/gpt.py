@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from mijax.nets.dropout import Dropout
+
 KERNEL_INIT = nn.initializers.normal(0.02)
 
 
@@ -45,7 +47,7 @@ class Block(nn.Module):
         self.norm_mlp = nn.LayerNorm(dtype=self.dtype)
         self.expand = dense(4 * self.width)
         self.contract = dense(self.width)
-        self.drop = nn.Dropout(self.dropout)
+        self.drop = Dropout(self.dropout)
 
     def _attend(self, query: jax.Array, key: jax.Array, value: jax.Array, visible: jax.Array) -> jax.Array:
         """(R Lq, W), (R Lk, W) twice and (R, Lq, Lk) bool -> (R Lq, W)."""
@@ -75,10 +77,11 @@ class Block(nn.Module):
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Attend from one new token: (B, max_length, W) twice, (B, W), (B,) -> new keys, new values, (B, W)."""
         query, key, value = jnp.split(self.queries_keys_values(self.norm_attention(x)), 3, axis=-1)
-        here = jnp.arange(keys.shape[1]) == position[:, None]
+        slots = jnp.arange(keys.shape[1])[None]
+        here = slots == position[:, None]
         keys = jnp.where(here[..., None], key[:, None], keys)
         values = jnp.where(here[..., None], value[:, None], values)
-        visible = (jnp.arange(keys.shape[1]) <= position[:, None])[:, None]
+        visible = (slots <= position[:, None])[:, None]
         flat = (-1, self.width)
         x = x + self.project(self._attend(query, keys.reshape(flat), values.reshape(flat), visible))
         return keys, values, self._mlp(x, True)
@@ -97,7 +100,7 @@ class GPT(nn.Module):
     def setup(self) -> None:
         self.blocks = [Block(self.width, self.heads, self.dropout, self.dtype) for _ in range(self.layers)]
         self.norm = nn.LayerNorm(dtype=self.dtype)
-        self.drop = nn.Dropout(self.dropout)
+        self.drop = Dropout(self.dropout)
 
     def __call__(
         self, x: jax.Array, segment: jax.Array, position: jax.Array, deterministic: bool = True
@@ -109,7 +112,7 @@ class GPT(nn.Module):
         code = jnp.asarray(sine_positions(self.max_length, self.width), self.dtype)
         x = self.drop(x + code[position.reshape(-1)], deterministic=deterministic)
         causal = jnp.tril(jnp.ones((position.shape[1], position.shape[1]), bool))
-        visible = causal & (segment[:, :, None] == segment[:, None, :])
+        visible = causal[None] & (segment[:, :, None] == segment[:, None, :])
         for block in self.blocks:
             x = block(x, visible, deterministic)
         return self.norm(x)

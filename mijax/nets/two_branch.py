@@ -69,24 +69,20 @@ class HistoryEncoder(nn.Module):
 class TwoBranchQ(nn.Module):
     """Q(h, a) from a memory branch over the history and a memoryless branch over the observation."""
 
+    top: HistoryEncoder
     observation_spec: ArraySpec
-    num_actions: int
-    max_length: int
-    memory: MemoryName
-    network: NetworkConfig
     features: int
     bottom_psi: bool  # the memoryless branch has psi's architecture, so that it can start from it
     predicts_state: bool  # the memory branch has a head that predicts z_s (the auxiliary task)
 
     def setup(self) -> None:
-        net, dtype = self.network, jnp.dtype(self.network.dtype)
-        self.top = HistoryEncoder(self.num_actions, self.max_length, self.memory, net)
+        net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
         if self.bottom_psi:
             self.bottom = encoder_for(self.observation_spec, self.features)
         else:
             width = 100 if self.observation_spec.is_image else 128
             self.bottom = ObservationEmbedder(width, dtype)
-        self.q_head = MLP(net.critic_hidden, self.num_actions, dtype)
+        self.q_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
         if self.predicts_state:
             self.state_head = MLP(net.auxiliary_hidden, self.features, dtype)
 
@@ -99,7 +95,7 @@ class TwoBranchQ(nn.Module):
         predicted = None
         if self.predicts_state:
             predicted = self.state_head(summary).astype(jnp.float32).reshape(*shape, self.features)
-        return q.reshape(*shape, self.num_actions), predicted
+        return q.reshape(*shape, self.top.num_actions), predicted
 
     def initial_state(self, batch: int) -> MemoryState:
         """The memory of `batch` episodes that have not started."""
@@ -117,15 +113,12 @@ class TwoBranchQ(nn.Module):
 class InformationModel(nn.Module):
     """f(h): the mean of a Gaussian over z_s given the history (paper Eq. 4, 5). A network of its own."""
 
-    num_actions: int
-    max_length: int
-    memory: MemoryName
-    network: NetworkConfig
+    history: HistoryEncoder
     features: int
 
     def setup(self) -> None:
-        self.history = HistoryEncoder(self.num_actions, self.max_length, self.memory, self.network)
-        self.head = MLP(self.network.auxiliary_hidden, self.features, jnp.dtype(self.network.dtype))
+        network = self.history.network
+        self.head = MLP(network.auxiliary_hidden, self.features, jnp.dtype(network.dtype))
 
     def __call__(self, tokens: Tokens, deterministic: bool = True) -> jax.Array:
         """(R, L, F) the expected z_s at every token."""

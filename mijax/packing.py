@@ -53,7 +53,7 @@ def gather_rows(replay: Replay, slots: jax.Array, layout: Layout, rows: int, max
     `frames`.
     """
     row_length = replay.data.reward.shape[1]
-    step = jnp.arange(row_length)
+    step = jnp.arange(row_length)[None]
     length = replay.length[slots]
     target = layout.row[:, None] * row_length + layout.offset[:, None] + step
     target = jnp.where(step < length[:, None], target, rows * row_length).reshape(-1)
@@ -89,14 +89,26 @@ def distinct(frames: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     Frames are told apart by 64 bits of a random linear hash. `capacity` must bound the number of distinct frames.
     """
     num = frames.shape[0]
-    flat = frames.reshape(num, -1)
-    if flat.dtype != jnp.uint8:
-        flat = jax.lax.bitcast_convert_type(flat, jnp.uint32).reshape(num, -1)
+    flat = _as_bits(frames.reshape(num, -1))
     multipliers = jax.random.bits(jax.random.key(0), (2, flat.shape[1]), jnp.uint32) | 1
-    high, low = (jnp.sum(flat.astype(jnp.uint32) * m, axis=1, dtype=jnp.uint32) for m in multipliers)
+    high, low = (jnp.sum(flat * m, axis=1, dtype=jnp.uint32) for m in multipliers[:, None])
     high, low, order = jax.lax.sort((high, low, jnp.arange(num, dtype=jnp.int32)), num_keys=2)
     changed = jnp.concatenate([jnp.zeros((1,), bool), (high[1:] != high[:-1]) | (low[1:] != low[:-1])])
     rank = jnp.cumsum(changed, dtype=jnp.int32)
     index = jnp.zeros((num,), jnp.int32).at[order].set(rank)
     first = jnp.zeros((capacity,), jnp.int32).at[rank].set(order, mode="drop")
     return frames[first], index
+
+
+def _as_bits(x: jax.Array) -> jax.Array:
+    """uint32 that differ where the numbers of `x` do; 0.0 and -0.0 are one number.
+
+    Short floats such as 1.0 and -0.5 differ in their highest bits alone, of which a linear hash keeps few: they are
+    mixed downwards first.
+    """
+    if x.dtype.itemsize == 1:
+        return x.astype(jnp.uint32)
+    x = jnp.where(x == 0, jnp.zeros((), x.dtype), x)
+    bits = jax.lax.bitcast_convert_type(x, jnp.dtype(f"uint{8 * x.dtype.itemsize}")).astype(jnp.uint32)
+    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
+    return bits ^ (bits >> 13)

@@ -5,6 +5,8 @@ the finished ones and the environment is given another. So an episode is never c
 sampled, and the oldest finished one is overwritten first.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -41,6 +43,8 @@ class Replay:
 def init_replay(example: StepRecord, capacity: int, horizon: int) -> Replay:
     """An empty replay for records shaped like `example`, whose leading axis is the environments'."""
     num_envs = example.reward.shape[0]
+    if capacity < num_envs:
+        raise ValueError(f"a replay of {capacity} episodes cannot serve {num_envs} environments that end at once")
     slots = capacity + num_envs
     data = jax.tree.map(lambda x: jnp.zeros((slots, horizon + 1, *x.shape[1:]), x.dtype), example)
     return Replay(
@@ -56,18 +60,19 @@ def write(replay: Replay, record: StepRecord, position: jax.Array, keep: jax.Arr
     """Store one step of every environment at (E,) `position` of its open episode, where `keep`."""
     slots = jnp.where(keep, replay.open_slots, replay.length.shape[0])
     data = jax.tree.map(lambda x, y: x.at[slots, position].set(y.astype(x.dtype), mode="drop"), replay.data, record)
-    return replay.replace(data=data)
+    return dataclasses.replace(replay, data=data)
 
 
 def finish(replay: Replay, done: jax.Array, length: jax.Array) -> Replay:
     """Close the episodes of (E,) `done` environments, each (E,) `length` steps long, and open new slots for them."""
     num_envs = done.shape[0]
-    order = replay.count + jnp.cumsum(done) - done
+    order = replay.count + jnp.cumsum(done, dtype=jnp.int32) - done.astype(jnp.int32)
     ring = order % replay.capacity
     oldest = replay.finished[ring]
     fresh = jnp.where(order < replay.capacity, num_envs + order, oldest).astype(jnp.int32)
     closed = jnp.where(done, replay.open_slots, replay.length.shape[0])
-    return replay.replace(
+    return dataclasses.replace(
+        replay,
         length=replay.length.at[closed].set(length, mode="drop"),
         finished=replay.finished.at[jnp.where(done, ring, replay.capacity)].set(replay.open_slots, mode="drop"),
         open_slots=jnp.where(done, fresh, replay.open_slots),

@@ -1,0 +1,117 @@
+"""Losses and rewards on the privileged features against plain loops."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mijax.losses import information as info
+
+
+def random_features(seed: int, *shape: int) -> jax.Array:
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+
+
+def cosine(x: np.ndarray, y: np.ndarray) -> float:
+    return float(x @ y / (np.linalg.norm(x) * np.linalg.norm(y)))
+
+
+def test_prediction_mse_by_hand():
+    predicted, z_s = random_features(0, 2, 3, 4), random_features(1, 2, 3, 4)
+    mask = jnp.array([[True, True, False], [False, True, False]])
+    loss, metrics = info.prediction_mse(predicted, z_s, mask, jnp.float32(2.5))
+    errors = [sum((float(p) - float(z)) ** 2 for p, z in zip(predicted[i, j], z_s[i, j], strict=True)) / 2.5
+              for i, j in ((0, 0), (0, 1), (1, 1))]
+    assert float(loss) == pytest.approx(np.mean(errors), rel=1e-5)
+    assert float(metrics["explained"]) == pytest.approx(1 - np.mean(errors), rel=1e-4)
+
+
+def test_predicting_the_mean_costs_one_in_units_of_the_variance():
+    z_s = random_features(2, 100, 5)
+    mean = jnp.broadcast_to(z_s.mean(0, keepdims=True), z_s.shape)
+    variance = jnp.var(z_s, axis=0).sum()
+    loss, metrics = info.prediction_mse(mean, z_s, jnp.ones(100, bool), variance)
+    assert float(loss) == pytest.approx(1, rel=1e-5)
+    assert float(metrics["explained"]) == pytest.approx(0, abs=1e-5)
+
+
+def test_prediction_cosine_by_hand():
+    predicted, z_s = random_features(3, 4, 6), random_features(4, 4, 6)
+    loss, metrics = info.prediction_cosine(predicted, z_s, jnp.array([True, False, True, True]))
+    expected = np.mean([cosine(np.asarray(predicted[i]), np.asarray(z_s[i])) for i in (0, 2, 3)])
+    assert float(loss) == pytest.approx(1 - expected, rel=1e-5)
+    assert float(metrics["cosine"]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_no_gradient_flows_into_z_s():
+    predicted, z_s, mask = random_features(5, 3, 4), random_features(6, 3, 4), jnp.array([True, True, False])
+    for loss in (info.prediction_mse, info.prediction_cosine):
+        of_predicted, of_z_s = jax.grad(lambda p, z, loss=loss: loss(p, z, mask)[0], (0, 1))(predicted, z_s)
+        assert of_predicted[:2].any(axis=-1).all()
+        assert not of_predicted[2].any()
+        assert not of_z_s.any()
+
+
+def test_cosine_is_signed_and_finite_at_zero():
+    z = random_features(7, 5)
+    assert float(info.cosine(z, 3 * z)) == pytest.approx(1)
+    assert float(info.cosine(z, -z)) == pytest.approx(-1)
+    assert float(info.cosine(z, 0 * z)) == 0
+    assert jnp.isfinite(jax.grad(lambda f: info.cosine(z, f))(0 * z)).all()
+
+
+def test_cosine_bonus_by_hand():
+    z, f, before = random_features(8, 2, 3), random_features(9, 2, 3), random_features(10, 2, 3)
+    expected = [cosine(np.asarray(z[i]), np.asarray(f[i])) - cosine(np.asarray(z[i]), np.asarray(before[i]))
+                for i in range(2)]
+    np.testing.assert_allclose(info.cosine_bonus(z, f, before), expected, rtol=1e-5)
+
+
+def test_cosine_bonus_punishes_turning_to_the_opposite():
+    """With |cos| the bonus of turning from z to -z would be 0."""
+    z = random_features(11, 4)
+    assert float(info.cosine_bonus(z, -z, z)) == pytest.approx(-2)
+    assert float(info.cosine_bonus(z, z, -z)) == pytest.approx(2)
+
+
+def test_explained_variance_bonus_by_hand():
+    z, f, before = jnp.array([1.0, 0.0]), jnp.array([1.0, 1.0]), jnp.array([0.0, 2.0])
+    assert float(info.explained_variance_bonus(z, f, before, 2.0)) == (5 - 1) / 2
+
+
+def test_bonuses_sum_over_an_episode_to_what_was_learned_when_z_is_constant():
+    steps, features = 9, 4
+    z = jnp.tile(random_features(12, 1, features), (steps, 1))
+    f = random_features(13, steps + 1, features)
+    variance = 3.0
+    total = info.explained_variance_bonus(z, f[1:], f[:-1], variance).sum()
+    before, after = (float(((z[0] - f[t]) ** 2).sum()) for t in (0, -1))
+    assert float(total) == pytest.approx((before - after) / variance, rel=1e-4)
+    total = info.cosine_bonus(z, f[1:], f[:-1]).sum()
+    assert float(total) == pytest.approx(float(info.cosine(z[0], f[-1]) - info.cosine(z[0], f[0])), rel=1e-4)
+
+
+def test_finding_out_a_binary_variable_earns_one():
+    """z_s takes two values equally often; f starts at the mean and ends at the truth: all of the variance."""
+    values = random_features(14, 2, 6)
+    mean = values.mean(0)
+    variance = jnp.var(values, axis=0).sum()
+    earned = [float(info.explained_variance_bonus(z, z, mean, variance)) for z in values]
+    assert np.mean(earned) == pytest.approx(1, rel=1e-5)
+
+
+def test_shapes_that_would_broadcast_are_errors():
+    z, row, mask = jnp.zeros((3, 4)), jnp.zeros((1, 4)), jnp.ones(3, bool)
+    for call in (
+        lambda: info.prediction_mse(z, row, mask),
+        lambda: info.prediction_mse(row, z, mask),
+        lambda: info.prediction_mse(z, z, jnp.ones(1, bool)),
+        lambda: info.prediction_cosine(z, row, mask),
+        lambda: info.prediction_cosine(z, z, jnp.ones(1, bool)),
+        lambda: info.cosine_bonus(z, z, row),
+        lambda: info.cosine_bonus(row, z, z),
+        lambda: info.explained_variance_bonus(z, row, z, 1.0),
+        lambda: info.explained_variance_bonus(row, z, z, 1.0),
+    ):
+        with pytest.raises(AssertionError):
+            call()

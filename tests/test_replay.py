@@ -1,0 +1,238 @@
+"""The replay of whole episodes, and packing them into rows, against plain Python."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs_mjx import registry
+from envs_mjx.grid.world import GridWorld
+from mijax.packing import distinct, first_fit, gather_rows, one_per_row, row_choices
+from mijax.replay import Replay, StepRecord, finish, init_replay, sample_episodes, write
+
+HORIZON, NUM_ENVS, FEATURES = 4, 3, 2
+quick = settings(max_examples=25, deadline=None, derandomize=True)
+
+
+def record_of(episode: np.ndarray, position: np.ndarray, length: np.ndarray) -> StepRecord:
+    """A step whose every field tells which episode and which step it is."""
+    mark = (10 * episode + position).astype(np.float32)
+    fields: dict[str, Any] = {
+        "observation": (mark[:, None] % 256).astype(np.uint8),
+        "previous_action": np.where(position == 0, -1, mark % 7).astype(np.int8),
+        "reward": mark + np.float32(0.25),
+        "terminated": (position == length) & (episode % 2 == 0),
+        "truncated": (position == length) & (episode % 2 == 1),
+        "z_s": np.stack([mark, -mark], -1),
+    }
+    return StepRecord(**fields)
+
+
+write_step = jax.jit(write)
+finish_step = jax.jit(finish)
+
+
+@dataclasses.dataclass
+class Collected:
+    """A replay beside a plain list of what it should hold."""
+
+    replay: Replay
+    finished: list[tuple[int, int]]  # (episode, steps) in order of completion, oldest first
+
+
+def collect(lengths: list[int], capacity: int, steps: int) -> Collected:
+    """Episodes of the given numbers of steps, handed out in turn to the environments; some are open at the end."""
+    queue = list(enumerate(lengths))
+    current = np.array([queue.pop(0) for _ in range(NUM_ENVS)])
+    position = np.zeros(NUM_ENVS, int)
+    first = record_of(current[:, 0], position, current[:, 1])
+    replay = write_step(init_replay(first, capacity, HORIZON), first, jnp.asarray(position))
+    finished = []
+    for _ in range(steps):
+        position += 1
+        replay = write_step(replay, record_of(current[:, 0], position, current[:, 1]), jnp.asarray(position))
+        done = position == current[:, 1]
+        replay = finish_step(replay, jnp.asarray(done), jnp.asarray(position + 1))
+        for env in np.flatnonzero(done):
+            finished.append((int(current[env, 0]), int(current[env, 1])))
+            current[env], position[env] = queue.pop(0), 0
+        first = record_of(current[:, 0], position, current[:, 1])
+        replay = write_step(replay, first, jnp.asarray(position), jnp.asarray(done))
+    return Collected(replay, finished)
+
+
+NUM_STEPS = 12
+episode_lengths = st.lists(st.integers(1, HORIZON), min_size=NUM_ENVS * (NUM_STEPS + 1),
+                           max_size=NUM_ENVS * (NUM_STEPS + 1))
+
+
+def stored(replay: Replay) -> list[tuple[int, int]]:
+    """(episode, steps) of all that can be sampled, oldest first, after checking every step of each."""
+    replay = jax.device_get(replay)
+    count, capacity = int(replay.count), replay.capacity
+    order = range(count) if count < capacity else (i % capacity for i in range(count, count + capacity))
+    found = []
+    for slot in np.asarray(replay.finished)[list(order)]:
+        length = int(replay.length[slot])
+        data = jax.tree.map(lambda x, slot=slot, length=length: np.asarray(x[slot, :length]), replay.data)
+        episode = int(data.reward[0]) // 10
+        steps = np.arange(length)
+        expected = record_of(np.full(length, episode), steps, np.full(length, length - 1))
+        jax.tree.map(np.testing.assert_array_equal, data, expected)
+        found.append((episode, length - 1))
+    return found
+
+
+@quick
+@given(episode_lengths, st.sampled_from([NUM_ENVS, NUM_ENVS + 2]))
+def test_the_latest_finished_episodes_come_back_exactly_as_written(lengths: list[int], capacity: int):
+    collected = collect(lengths, capacity, NUM_STEPS)
+    assert stored(collected.replay) == collected.finished[-capacity:]
+    assert int(collected.replay.count) == len(collected.finished)
+    finished = collected.replay.finished[: len(collected.finished)].tolist()
+    slots = finished + collected.replay.open_slots.tolist()
+    assert len(set(slots)) == len(slots)  # an open episode's slot is nobody else's
+
+
+sample = jax.jit(sample_episodes, static_argnums=2)
+
+
+@quick
+@given(episode_lengths)
+def test_every_finished_episode_is_sampled_and_no_open_one(lengths: list[int]):
+    collected = collect(lengths, NUM_ENVS + 2, NUM_STEPS)
+    slots = np.asarray(sample(collected.replay, jax.random.key(len(collected.finished)), 256))
+    episodes = {int(reward) // 10 for reward in np.asarray(collected.replay.data.reward)[slots, 0]}
+    assert episodes == {episode for episode, _ in collected.finished[-NUM_ENVS - 2 :]}
+
+
+def test_sampling_is_uniform_over_episodes_whatever_their_length():
+    replay = collect([1, 4, 1, 4, 4, 4, 4] + [4] * 30, NUM_ENVS + 2, 5).replay
+    lengths = [steps for _, steps in stored(replay)]
+    assert set(lengths) == {1, 4}
+    slots = np.asarray(sample(replay, jax.random.key(0), 10_000))
+    counts = np.bincount(slots)[np.asarray(replay.finished)[: len(lengths)]]
+    np.testing.assert_allclose(counts / 10_000, 1 / len(lengths), atol=4 * np.sqrt(0.25 / 10_000))
+
+
+def test_all_environments_end_at_once_in_the_smallest_replay():
+    for rounds in (1, 2, 3, 5):
+        collected = collect([2] * 60, NUM_ENVS, 2 * rounds)
+        assert len(collected.finished) == NUM_ENVS * rounds
+        assert stored(collected.replay) == collected.finished[-NUM_ENVS:]
+
+
+def test_too_small_a_replay_is_refused():
+    example = record_of(np.arange(NUM_ENVS), np.zeros(NUM_ENVS, int), np.ones(NUM_ENVS, int))
+    with pytest.raises(ValueError, match="2 episodes cannot serve 3 environments"):
+        init_replay(example, NUM_ENVS - 1, HORIZON)
+
+
+# Packing
+
+ROW, BATCH = 10, 8
+fit = jax.jit(first_fit, static_argnums=1)
+
+
+def first_fit_reference(lengths: list[int]) -> list[tuple[int, int]]:
+    """(row, offset) of each episode: the longest first, each in the first row that has room."""
+    used, places = [0] * len(lengths), [(0, 0)] * len(lengths)
+    for i in sorted(range(len(lengths)), key=lambda i: -lengths[i]):
+        row = next(r for r in range(len(lengths)) if used[r] + lengths[i] <= ROW)
+        places[i] = row, used[row]
+        used[row] += lengths[i]
+    return places
+
+
+@quick
+@given(st.lists(st.integers(1, ROW), min_size=BATCH, max_size=BATCH))
+def test_first_fit(lengths: list[int]):
+    layout = fit(jnp.array(lengths, jnp.int32), ROW)
+    taken = np.zeros((BATCH, ROW), int)
+    for row, offset, length in zip(layout.row.tolist(), layout.offset.tolist(), lengths, strict=True):
+        assert 0 <= offset <= ROW - length
+        taken[row, offset : offset + length] += 1
+    assert taken.max() == 1
+    assert taken.sum() == sum(lengths)
+    assert taken.any(axis=1).tolist() == [row < int(layout.num_rows) for row in range(BATCH)]
+    assert list(zip(layout.row.tolist(), layout.offset.tolist(), strict=True)) == first_fit_reference(lengths)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 4, 7, 64])
+def test_row_choices_end_with_a_row_per_episode(batch: int):
+    choices = row_choices(batch)
+    assert choices == tuple(sorted(set(choices)))
+    assert choices[0] >= 1
+    assert choices[-1] == batch
+
+
+def check_distinct(frames: np.ndarray, spare: int = 3) -> None:
+    """`distinct` agrees with NumPy on how many frames differ, and gives each back exactly."""
+    expected = len(np.unique(frames.reshape(len(frames), -1), axis=0))
+    kept, index = jax.jit(distinct, static_argnums=1)(jnp.asarray(frames), expected + spare)
+    kept, index = np.asarray(kept), np.asarray(index)
+    assert kept.shape == (expected + spare, *frames.shape[1:])
+    assert kept.dtype == frames.dtype
+    assert sorted(set(index.tolist())) == list(range(expected))
+    np.testing.assert_array_equal(kept[index], frames)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float32", "float16", "int32", "bool"])
+def test_distinct_frames_of_any_type(dtype: str):
+    rng = np.random.default_rng(0)
+    check_distinct(rng.integers(-1 if dtype[0] in "fi" else 0, 2, (60, 2, 2)).astype(dtype))
+
+
+def test_distinct_floats_that_differ_in_their_last_bit():
+    frames = np.array([[1.0, 0.0], [np.nextafter(np.float32(1), 2), 0.0], [1.0, -0.0]], np.float32)
+    check_distinct(frames, spare=0)
+
+
+@pytest.mark.parametrize("domain", ["heaven_hell", "sphinx", "carflag_2d"])
+def test_no_two_observations_of_a_domain_share_a_hash(domain: str):
+    """Every cell with every goal shown or none: more than can occur."""
+    env = registry.make(domain)
+    assert isinstance(env, GridWorld)
+    cells, shown = np.divmod(np.arange(env.tables.walls.size * (len(env.tables.goals) + 1)), len(env.tables.goals) + 1)
+    frames = np.asarray(jax.jit(jax.vmap(env.observe))(jnp.asarray(cells), jnp.asarray(shown)))
+    check_distinct(np.concatenate([frames, frames[::7]]))
+
+
+@pytest.fixture(scope="module")
+def replay() -> Replay:
+    return collect([3, 1, 4, 2, 2, 4, 1, 3] + [4] * 20, 8, 8).replay
+
+
+@pytest.mark.parametrize("max_frames", [None, 20])
+@pytest.mark.parametrize("is_packed", [True, False])
+def test_gather_rows(replay: Replay, is_packed: bool, max_frames: int | None):
+    """Rows of a shuffled batch with a repeated episode, against a loop over tokens."""
+    slots = np.asarray(replay.finished)[[3, 0, 2, 3, 1]]
+    lengths, row_length = np.asarray(replay.length)[slots], HORIZON + 1
+    layout = fit(jnp.asarray(lengths), row_length) if is_packed else one_per_row(len(slots))
+    rows = len(slots)
+    gather = jax.jit(gather_rows, static_argnums=(3, 4))
+    tokens = gather(replay, jnp.asarray(slots), layout, rows, max_frames)
+    frames = np.asarray(tokens.frames)
+    assert (tokens.frame is None) == (max_frames is None)
+    assert len(frames) == (max_frames or rows * row_length)
+    frame = np.arange(rows * row_length).reshape(rows, -1) if tokens.frame is None else np.asarray(tokens.frame)
+    segment = np.zeros((rows, row_length), int)
+    for episode, slot in enumerate(slots):
+        for step in range(lengths[episode]):
+            place = int(layout.row[episode]), int(layout.offset[episode]) + step
+            segment[place] = episode + 1
+            assert tokens.position[place] == step
+            np.testing.assert_array_equal(frames[frame[place]], replay.data.observation[slot, step])
+            for field in ("previous_action", "reward", "terminated", "truncated", "z_s"):
+                np.testing.assert_array_equal(
+                    np.asarray(getattr(tokens, field))[place], np.asarray(getattr(replay.data, field))[slot, step])
+    np.testing.assert_array_equal(tokens.segment, segment)
+    padding = segment == 0
+    assert (np.asarray(tokens.previous_action)[padding] == -1).all()
+    assert not np.asarray(tokens.position)[padding].any()

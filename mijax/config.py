@@ -161,9 +161,12 @@ class EvaluationConfig:
     """Environment steps between evaluations."""
     episodes: int = 20
     """Episodes per evaluation."""
+    discount: float = 0.99
+    """gamma of the discounted return that is reported, whatever the agent learns with."""
 
     def __post_init__(self) -> None:
         _require_at_least("evaluation.", self, 1, "every", "episodes")
+        require(0 < self.discount <= 1, "evaluation.discount", self.discount, "a number in (0, 1]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,8 +220,9 @@ class Config:
         _require_at_least("", self, 1, "steps", "num_envs", "steps_per_iteration")
         steps = self.iteration_steps
         updates = self.dqn.updates_per_step * steps
-        require(updates >= 1 and abs(updates - round(updates)) < 1e-9, "dqn.updates-per-step",
-                self.dqn.updates_per_step, f"a whole number of updates in num-envs x steps-per-iteration = {steps} steps")
+        whole = updates >= 1 and abs(updates - round(updates)) < 1e-9
+        require(whole, "dqn.updates-per-step", self.dqn.updates_per_step,
+                f"a whole number of updates in num-envs x steps-per-iteration = {steps} steps")
         require(self.evaluation.every % steps == 0, "evaluation.every", self.evaluation.every,
                 f"a multiple of num-envs x steps-per-iteration = {steps}")
 
@@ -248,3 +252,16 @@ def _build(kind: Any, values: Mapping[str, Any], prefix: str) -> Any:
             value = _build(types[name], value, f"{prefix}{name}.")
         built[name] = tuple(value) if isinstance(value, list) else value
     return kind(**built)
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """`5` -> (0, 1, 2, 3, 4); `3,7` -> (3, 7); `3,` -> (3,)."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    valid = bool(parts) and all(part.isdigit() for part in parts)
+    require(valid, "seeds", text, "a number of seeds such as 5, or a list such as 3,7")
+    numbers = tuple(int(part) for part in parts)
+    if "," not in text:
+        require(numbers[0] >= 1, "seeds", text, "at least one seed")
+        return tuple(range(numbers[0]))
+    require(len(set(numbers)) == len(numbers), "seeds", text, "different seeds")
+    return numbers

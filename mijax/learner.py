@@ -6,6 +6,7 @@ devices, checkpoints and logging are wrapped around these two functions.
 """
 
 import dataclasses
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -90,7 +91,7 @@ class Learner:
             epsilon = self.epsilon(self.environment_steps(state))
             state, totals = self._collect(state, epsilon, self.config.steps_per_iteration, key_collect)
             state, metrics = self._learn(state, key_update)
-            return state.replace(iteration=state.iteration + 1), (totals, metrics)
+            return dataclasses.replace(state, iteration=state.iteration + 1), (totals, metrics)
 
         state, (totals, losses) = jax.lax.scan(iterate, state, None, iterations or self.iterations_per_chunk)
         totals = jax.tree.map(lambda x: jnp.sum(x, axis=0), totals)
@@ -110,7 +111,7 @@ class Learner:
         if representation is None:
             return None
         phi = encoder_for(self.env.state_spec, self.config.stage1.features)
-        return lambda states: phi.apply({"params": representation.phi}, states)
+        return lambda states: cast(jax.Array, phi.apply({"params": representation.phi}, states))
 
     def _collect(
         self, state: LearnerState, epsilon: jax.Array, steps: int, key: jax.Array
@@ -119,18 +120,19 @@ class Learner:
         params = state.agent.params["agent"]
 
         def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
-            return collect_step(self.env, self.agent, params, label, epsilon, *carry, key), None
+            episodes, replay, totals = carry
+            return collect_step(self.env, self.agent, params, label, epsilon, episodes, replay, totals, key), None
 
         carry = (state.episodes, state.replay, EpisodeTotals.zero())
         (episodes, replay, totals), _ = jax.lax.scan(step, carry, jax.random.split(key, steps))
-        return state.replace(episodes=episodes, replay=replay), totals
+        return dataclasses.replace(state, episodes=episodes, replay=replay), totals
 
     def _learn(self, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Metrics]:
         def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, Metrics]:
             return self.update(agent, state.replay, state.representation, key)
 
         agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, self.config.updates_per_iteration))
-        return state.replace(agent=agent), jax.tree.map(jnp.mean, metrics)
+        return dataclasses.replace(state, agent=agent), jax.tree.map(jnp.mean, metrics)
 
     def update(
         self, agent: AgentState, replay: Replay, representation: Representation | None, key: jax.Array

@@ -1,6 +1,7 @@
 """Running environments: collecting experience into the replay, and greedy evaluation."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +56,7 @@ class EpisodeTotals:
         }
 
 
-def select(which: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
+def select(which: jax.Array, new: Any, old: Any) -> Any:
     """Per environment (leading axis): `new` where `which`, else `old`. Works on pytrees."""
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, old)
 
@@ -125,7 +126,7 @@ def evaluate(env: Environment, agent: DQN, params: Params, num_episodes: int, ke
     The discounted return is sum_t gamma^t r_{t+1}; `value` is what the agent promises itself of it, and of the bonus,
     on the first observation: far above the return means that it believes episodes it has learnt by heart.
     """
-    discount = agent.config.dqn.discount
+    discount = agent.config.evaluation.discount
     key_start, key_steps = jax.random.split(key)
     episodes = start_episodes(env, agent, num_episodes, key_start)
     false = jnp.zeros((num_episodes,), bool)

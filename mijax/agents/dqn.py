@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any, cast
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -42,10 +41,10 @@ class DQN:
         """Fresh parameters; the memoryless branch starts from psi when the agent uses a representation."""
         tokens = _example_tokens(self.network)
         key_agent, key_f = jax.random.split(key)
-        agent = self.network.init(key_agent, tokens)["params"]
+        agent = dict(self.network.init(key_agent, tokens)["params"])
         if self.declaration.uses_z_s and self.config.information.start_from_psi:
-            agent = {**agent, "bottom": representation.psi}
-        params = {"agent": agent}
+            agent["bottom"] = cast(Representation, representation).psi
+        params: dict[str, Params] = {"agent": agent}
         if self.information_model is not None:
             params["f"] = self.information_model.init(key_f, tokens)["params"]
         target = jax.tree.map(jnp.copy, params["agent"])
@@ -99,11 +98,10 @@ class DQN:
         """The sum of the TD loss, the weighted auxiliary loss and f's own loss; () and its parts."""
         key_agent, key_f = jax.random.split(key)
         q, predicted = self._apply(self.network, params["agent"], tokens, key_agent)
-        q_select = q if self._exact else self.network.apply({"params": params["agent"]}, tokens)[0]
-        q_target, _ = self.network.apply({"params": target}, tokens)
+        q_select = q if self._exact else self._clean(self.network, params["agent"], tokens)[0]
+        q_target, _ = self._clean(self.network, target, tokens)
         bonus, loss, metrics = jnp.zeros_like(tokens.reward), jnp.zeros(()), {}
         if self.information_model is not None:
-            chex.assert_not_none(representation)
             loss, bonus, metrics = self._information(params["f"], predicted, tokens, representation, key_f)
         loss_td, parts = self._td(q, q_select, q_target, bonus, tokens)
         return loss + loss_td, metrics | parts
@@ -116,7 +114,7 @@ class DQN:
             state.params, state.target, tokens, representation, key
         )
         steps, optimizer = self.optimizer.update(grads, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, steps)
+        params = cast(Params, optax.apply_updates(state.params, steps))
         target = optax.incremental_update(params["agent"], state.target, self.config.dqn.target_rate)
         return AgentState(params, target, optimizer, state.updates + 1), metrics
 
@@ -131,6 +129,9 @@ class DQN:
     def _apply(self, module: Any, params: Params, tokens: Tokens, key: jax.Array) -> Any:
         return module.apply({"params": params}, tokens, self._exact, rngs={"dropout": key})
 
+    def _clean(self, module: Any, params: Params, tokens: Tokens) -> Any:
+        return module.apply({"params": params}, tokens)
+
     def _information(
         self, params: Params, predicted: Any, tokens: Tokens, representation: Any, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, Metrics]:
@@ -138,12 +139,12 @@ class DQN:
 
         The bonus of an episode's first token is meaningless; no target uses it.
         """
-        options, variance, z_s = self.config.information, representation.z_s_variance, tokens.z_s
+        options, variance, z_s = self.config.information, representation.z_s_variance, cast(jax.Array, tokens.z_s)
         real = tokens.segment > 0
         f = self._apply(self.information_model, params, tokens, key)
         loss_f, parts_f = info.prediction_mse(f, z_s, real, variance)
         loss_k, parts_k = info.prediction_mse(predicted, z_s, real, variance)
-        f_t = jax.lax.stop_gradient(f if self._exact else self.information_model.apply({"params": params}, tokens))
+        f_t = jax.lax.stop_gradient(f if self._exact else self._clean(self.information_model, params, tokens))
         f_tm1 = jnp.roll(f_t, 1, axis=1)
         if options.intrinsic_form == "cosine":
             bonus = info.cosine_bonus(z_s, f_t, f_tm1)
@@ -171,7 +172,7 @@ class DQN:
             trace_t=trace,
         )
         loss, parts = td.td_loss(q[:, :-1], action, target, valid)
-        episodes = jnp.sum((tokens.position == 0) & (tokens.segment > 0))
+        episodes = jnp.sum((tokens.position == 0) & (tokens.segment > 0), dtype=jnp.float32)
         episode_bonus = jnp.sum(jnp.where(valid, bonus[:, 1:], 0)) / jnp.maximum(episodes, 1)
         return loss, {"loss/td": loss, "q/mean": parts["q"], "q/error": parts["td_error"], "train/bonus": episode_bonus}
 

@@ -18,7 +18,7 @@ class Variant:
 
 
 VARIANTS = {
-    "mi": Variant("Ours", "information bonus, prediction of z_s, psi as the memoryless branch (paper Section 3.2)", True),
+    "mi": Variant("Ours", "bonus for information on z_s, prediction of z_s, psi in the memoryless branch (Section 3.2)", True),
     "base": Variant("DTQN", "the plain two-branch memory agent (paper Appendix A.1)", False),
 }
 

@@ -1,0 +1,27 @@
+"""What a command sets before JAX starts: host devices and the persistent compilation cache."""
+
+import os
+import pathlib
+
+import jax
+
+CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def cores() -> int:
+    """CPU cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def prepare(host_devices: int = 1) -> None:
+    """Call once, before anything is computed.
+
+    Args:
+        host_devices: devices to make of a CPU; without effect on an accelerator.
+    """
+    if not os.environ.get(CACHE_VARIABLE):
+        cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mijax" / "jax"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    if host_devices > 1 and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        jax.config.update("jax_num_cpu_devices", host_devices)

@@ -1,0 +1,72 @@
+"""Stage 1 of a run: each seed's representation, learnt and probed, or taken from another run."""
+
+import json
+import pathlib
+import time
+from collections.abc import Callable
+
+import jax
+
+from envs_mjx.base import Environment
+from mijax.config import Config, Stage1Config
+from mijax.metrics import ProgressDisplay, RunError, RunFolder
+from mijax.representation import learn_representation
+from mijax.representation.probe import ProbeReport, format_report, probe
+from mijax.representation.storage import FACTS_FILE, load_representation, save_representation, write_atomically
+from mijax.types import Representation
+
+FOLDER = "representation"
+PROBE_FILE = "probe.json"
+
+
+def representation_key(seed: int) -> jax.Array:
+    """The key that a seed's stage 1 follows from."""
+    return jax.random.fold_in(jax.random.key(seed), 1)
+
+
+def folder_of(run: RunFolder, seed: int) -> pathlib.Path:
+    """Where a run keeps a seed's representation."""
+    return run.seed_path(seed) / FOLDER
+
+
+def reuse(source: RunFolder, run: RunFolder, env: Environment, seeds: tuple[int, ...]) -> None:
+    """Copy representations from another run: the same seed's where it has one, else its first.
+
+    Raises:
+        RunError: the other run is of another domain or has no representation.
+    """
+    found = [seed for seed in source.seeds() if folder_of(source, seed).is_dir()]
+    if not found:
+        raise RunError(f"{source.path}: holds no representation (no seed_K/{FOLDER})")
+    for seed in seeds:
+        origin = folder_of(source, seed if seed in found else found[0])
+        save_representation(load_representation(origin, env), env, folder_of(run, seed))
+
+
+def representations(
+    run: RunFolder, env: Environment, config: Config, seeds: tuple[int, ...], say: Callable[[str], None]
+) -> tuple[dict[int, Representation], dict[int, float]]:
+    """Every seed's representation, trained where the run has none yet, and the seconds that took."""
+    result, seconds = {}, {}
+    for seed in seeds:
+        started = time.perf_counter()
+        if not (folder_of(run, seed) / FACTS_FILE).exists():
+            learn(run, env, config.stage1, seed, say)
+        result[seed] = load_representation(folder_of(run, seed), env)
+        seconds[seed] = time.perf_counter() - started
+    return result, seconds
+
+
+def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say: Callable[[str], None]) -> ProbeReport:
+    """Train one seed's representation, keep it, probe it, keep and say what the probe found."""
+    key, folder = representation_key(seed), folder_of(run, seed)
+    with ProgressDisplay(f"stage 1, seed {seed}", config.epochs, unit="epochs") as progress:
+        representation, history = learn_representation(env, config, key, on_progress=progress.update)
+    report = probe(representation, env, config, jax.random.fold_in(key, 1), history)
+    save_representation(representation, env, folder)
+    timing = {"updates": history.updates, "updates_per_second": history.updates_per_second,
+              "compile_seconds": history.compile_seconds, "seconds": history.seconds}
+    write_atomically(folder / PROBE_FILE, json.dumps(report.as_dict() | timing, indent=2).encode())
+    say(f"stage 1, seed {seed}: {history.updates} updates in {history.compile_seconds + history.seconds:.0f} s "
+        f"({history.updates_per_second:.0f}/s), kept in {folder}\n{format_report(report)}")
+    return report

@@ -1,0 +1,288 @@
+"""`python -m mijax.train`: both stages on a domain, resumable, with curves at the end."""
+
+import argparse
+import dataclasses
+import pathlib
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+
+import configs
+from envs_mjx import registry
+from envs_mjx.base import Environment
+from envs_mjx.grid.optimal import optimum
+from mijax import checkpoint, report, runtime, stage1
+from mijax.agents.variants import variant
+from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
+from mijax.learner import make_learner
+from mijax.metrics import ProgressDisplay, RunError, RunFolder, TrackerName, make_tracker
+from mijax.representation import DivergenceError
+from mijax.representation.storage import RepresentationError
+from mijax.seeds import SeedRunner, training_key
+
+FINAL_EPISODES = 500
+"""Greedy episodes of each seed behind the numbers of summary.json."""
+USER_ERRORS = (ConfigError, RunError, RepresentationError, DivergenceError, registry.UnknownDomain,
+               registry.ContractError)
+"""What a user can mend: shown as one line."""
+
+
+class TrainingError(RunError):
+    """Training cannot go on; the run folder is whole up to its last checkpoint."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """Train an agent on a domain: stage 1 (representation), then stage 2 (task)."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    seeds: str = "1"
+    """How many seeds (5: seeds 0 to 4), or which ones (3,7; a single one with a comma: 3,)."""
+    out: pathlib.Path | None = None
+    """Run folder to make; default runs/DOMAIN-AGENT-MEMORY."""
+    resume: pathlib.Path | None = None
+    """Run folder to go on with, under its own options; only --steps may be given with it."""
+    representation: pathlib.Path | None = None
+    """Run whose stage 1 is taken over instead of training one."""
+    track: TrackerName = "none"
+    """Where metrics go besides the run folder."""
+
+
+def parse(arguments: Sequence[str]) -> TrainOptions:
+    """Options in two stages: the domain first, since its preset gives the defaults of all the others."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--domain", default="heaven_hell")
+    first.add_argument("--resume", type=pathlib.Path)
+    first.add_argument("--steps", type=int)
+    known, others = first.parse_known_args(list(arguments))
+    if known.resume is not None and not {"-h", "--help"} & set(others):
+        return _resumed(known, others, arguments)
+    default = TrainOptions(config=configs.preset(known.domain))
+    return tyro.cli(TrainOptions, default=default, args=list(arguments), prog="python -m mijax.train")
+
+
+def _resumed(known: argparse.Namespace, others: Sequence[str], arguments: Sequence[str]) -> TrainOptions:
+    stray = [word for word in others if word.startswith("--")]
+    stray += ["--domain"] if any(word.split("=")[0] == "--domain" for word in arguments) else []
+    require(not stray, "resume", " ".join(stray), "no other option than --steps: a run goes on under its own")
+    stored = RunFolder.open(known.resume).config()
+    seeds, track = stored.pop("seed_list"), stored.pop("track")
+    config = config_from_dict(stored)
+    if known.steps is not None:
+        require(known.steps >= config.steps, "steps", known.steps, f"at least the run's {config.steps}")
+        config = dataclasses.replace(config, steps=known.steps)
+    return TrainOptions(config, seeds=",".join(map(str, seeds)) + ",", resume=known.resume, track=track)
+
+
+def open_run(options: TrainOptions) -> RunFolder:
+    """The run folder to work in: a new one, or the one to go on with."""
+    if options.resume is not None:
+        return RunFolder.open(options.resume)
+    config = options.config
+    name = f"{config.domain.replace(':', '.')}-{config.agent}-{config.memory}"
+    stored = dataclasses.asdict(config) | {"seed_list": list(parse_seeds(options.seeds)), "track": options.track}
+    return RunFolder.create(options.out or pathlib.Path("runs") / name, stored)
+
+
+class CompileClock:
+    """Seconds XLA has spent compiling, from JAX's own events."""
+
+    def __init__(self) -> None:
+        self._total, self._lock = 0.0, threading.Lock()
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event: str, seconds: float, **_: str | int) -> None:
+        if event.endswith(("backend_compile_duration", "compilation_cache/cache_retrieval_time_sec")):
+            with self._lock:
+                self._total += seconds
+
+    def lap(self) -> float:
+        """Seconds since the last call."""
+        with self._lock:
+            seconds, self._total = self._total, 0.0
+        return seconds
+
+
+class StopRequest:
+    """Ctrl-C and SIGTERM ask for an orderly stop; a second one quits at once."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self.asked, self._say = False, say
+        self._previous = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def _handle(self, number: int, frame: Any) -> None:
+        del number, frame
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+        self._say("stopping: finishing the current chunk, then saving (once more to quit at once)")
+
+    def restore(self) -> None:
+        """Give the signals back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+
+def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolder:
+    """Run or go on with a training; returns its folder."""
+    config, seeds = options.config, parse_seeds(options.seeds)
+    declaration = variant(config.agent)
+    env = registry.make(config.domain)
+    registry.check_contract(env)
+    make_learner(env, config)  # refuses what cannot be trained before anything is written
+    source = None if options.representation is None else RunFolder.open(options.representation)
+    if source is not None:
+        source.require(domain=config.domain)
+    run = open_run(options)
+    if source is not None and declaration.uses_z_s:
+        stage1.reuse(source, run, env, seeds)
+    say(f"{run.path}: {declaration.title} ({config.agent}, {config.memory}) on {env.name}, seeds {list(seeds)}")
+
+    clock = CompileClock()
+    learnt, stage1_seconds = None, {}
+    if declaration.uses_z_s:
+        learnt, stage1_seconds = stage1.representations(run, env, config, seeds, say)
+    runner = SeedRunner(lambda pack: make_learner(env, config, pack), seeds, config.seeds.strategy)
+    checkpoints = checkpoint.open_all(run, seeds, config.checkpoint.keep)
+    _start(runner, run, checkpoints, learnt, say)
+    finished = _loop(runner, run, checkpoints, options, clock, say)
+    for each in checkpoints.values():
+        each.close()
+    if finished:
+        _conclude(runner, run, env, stage1_seconds, say)
+    return run
+
+
+def _start(
+    runner: SeedRunner, run: RunFolder, checkpoints: dict[int, checkpoint.Checkpoints], learnt: Any,
+    say: Callable[[str], None],
+) -> None:
+    """From the newest checkpoint, or from scratch; metrics after it are dropped and will be written again."""
+    if any(each.steps() for each in checkpoints.values()):
+        representation = None if learnt is None else learnt[runner.seeds[0]]
+        template = jax.eval_shape(runner.learner.init, training_key(0), representation)
+        step, states = checkpoint.load_latest(checkpoints, template, say)
+        runner.restore(states)
+        run.truncate_after(step)
+        say(f"going on from step {step:,}")
+    else:
+        run.truncate_after(-1)
+        runner.init(learnt)
+
+
+def _loop(
+    runner: SeedRunner, run: RunFolder, checkpoints: dict[int, checkpoint.Checkpoints], options: TrainOptions,
+    clock: CompileClock, say: Callable[[str], None],
+) -> bool:
+    """Chunks, evaluations, metrics and checkpoints up to the run's steps; False when asked to stop before."""
+    config = options.config
+    tracker, stop = make_tracker(options.track, run), StopRequest(say)
+    evaluations = 0
+
+    def save() -> None:
+        for seed, state in runner.states().items():
+            checkpoints[seed].save(runner.step, state)
+
+    try:
+        with ProgressDisplay("stage 2", config.steps, start=runner.step) as progress:
+            while runner.step < config.steps and not stop.asked:
+                rows = _advance(runner, config, clock)
+                for seed, row in rows.items():
+                    _refuse_divergence(seed, row, config)
+                    run.append(seed, row)
+                    tracker.log(seed, row)
+                progress.update(runner.step, _overview(rows))
+                evaluations += 1
+                if evaluations % config.checkpoint.every == 0 or runner.step >= config.steps or stop.asked:
+                    save()
+        if runner.step < config.steps:
+            save()
+            say(f"stopped at step {runner.step:,}; go on with: python -m mijax.train --resume {run.path}")
+    finally:
+        stop.restore()
+        tracker.close()
+    return runner.step >= config.steps
+
+
+def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[int, dict[str, float]]:
+    """One chunk and its evaluation: a row of metrics by seed. Wall seconds are those of all seeds together, shared."""
+    clock.lap()
+    started = time.perf_counter()
+    metrics = runner.advance()
+    compiled = clock.lap()
+    trained = time.perf_counter()
+    results = runner.evaluate(config.evaluation.episodes)
+    compiled_evaluation = clock.lap()
+    ended = time.perf_counter()
+    share = 1 / len(runner.seeds)
+    wall = {"compile": compiled + compiled_evaluation, "training": trained - started - compiled,
+            "evaluation": ended - trained - compiled_evaluation}
+    wall = {f"wall/{part}": max(seconds, 0) * share for part, seconds in wall.items()}
+    update = (runner.step - runner.learner.warmup_steps) // config.iteration_steps * config.updates_per_iteration
+    return {
+        seed: {"step": runner.step, "update": update}
+        | {f"evaluation/{name}": value for name, value in results[seed].items()} | metrics[seed] | wall
+        for seed in runner.seeds
+    }
+
+
+def _refuse_divergence(seed: int, row: Mapping[str, float], config: Config) -> None:
+    bad = [name for name, value in row.items() if name.startswith("loss/") and not np.isfinite(value)]
+    if bad:
+        raise TrainingError(
+            f"seed {seed}: {bad[0]} is {row[bad[0]]} at step {row['step']:,}; go on from the last checkpoint "
+            f"or try a smaller --dqn.learning-rate than {config.dqn.learning_rate}")
+
+
+def _overview(rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:
+    """What the progress line shows: means over the seeds."""
+    names = {"return": "evaluation/return", "success": "evaluation/success", "length": "evaluation/length",
+             "td": "loss/td", "aux": "loss/auxiliary", "f": "loss/f", "eps": "train/epsilon"}
+    columns = {short: [row[name] for row in rows.values() if name in row] for short, name in names.items()}
+    return {short: float(np.mean(values)) for short, values in columns.items() if values}
+
+
+def _conclude(
+    runner: SeedRunner, run: RunFolder, env: Environment, stage1_seconds: dict[int, float], say: Callable[[str], None]
+) -> None:
+    """The last evaluation, summary.json, curve.png and the table."""
+    final = runner.evaluate(FINAL_EPISODES)
+    best = optimum(env, runner.learner.config.evaluation.discount)
+    values = None if best is None else {
+        "return": best.undiscounted_return, "discounted_return": best.discounted_return, "success": best.success,
+        "length": best.length}
+    wall = {seed: {"stage1": stage1_seconds.get(seed, 0.0)} for seed in runner.seeds}
+    summary = report.summarise(run, optimum=values, final=final, wall=wall)
+    environment = runner.environment_seconds() / len(runner.seeds)
+    for result in summary["seeds"].values():
+        training = result["wall"].pop("training", 0.0)
+        result["wall"]["environment"] = min(environment, training)
+        result["wall"]["update"] = training - result["wall"]["environment"]
+    run.write_summary(summary)
+    say(report.write_report(report.load([run.path]), run.path))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        options = parse(arguments)
+        seeds = parse_seeds(options.seeds)
+        shard = options.config.seeds.strategy == "shard" or (options.config.seeds.strategy == "auto" and len(seeds) > 1)
+        runtime.prepare(host_devices=min(runtime.cores(), len(seeds)) if shard else 1)
+        train(options)
+    except USER_ERRORS as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

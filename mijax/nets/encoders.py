@@ -61,7 +61,7 @@ class Convolution(nn.Module):
 
 
 def _gather_blocks(x: jax.Array, size: int) -> jax.Array:
-    """(..., rows, columns, C) -> (..., rows // size, columns // size, size * size * C); what is left over is cut off."""
+    """(..., rows, columns, C) -> (..., rows // size, columns // size, size^2 C); what is left over is cut off."""
     if size == 1:
         return x
     *batch, rows, columns, channels = x.shape

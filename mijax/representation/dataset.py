@@ -94,7 +94,7 @@ def random_episodes(env: Environment, key: jax.Array, num_episodes: int) -> Epis
 def flatten(episodes: Episodes) -> Transitions:
     """Cut episodes into transitions and store each distinct frame once."""
     e = jax.tree.map(np.asarray, episodes)
-    num_episodes, horizon = e.reward.shape
+    horizon = e.reward.shape[1]
     row, step = np.nonzero(np.arange(horizon) < e.length[:, None])
     seen = np.arange(horizon + 1) <= e.length[:, None]
     states, state_index = _distinct(e.state, seen)

@@ -1,7 +1,7 @@
 """Training of stage 1 (paper Algorithm 1): phi, psi and the dynamics model against CLUB's estimator.
 
-A batch of B transitions is B draws from K distinct ones. Where K <= B, all K are computed once and weighted by how often
-they were drawn: the same losses for a fraction of the work. The same holds for the frames that have to be encoded.
+A batch of B transitions is B draws from K distinct ones. Where K <= B, all K are computed once and weighted by how
+often they were drawn: the same losses for a fraction of the work. The same holds for the frames to be encoded.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import optax
 from flax import struct
 
 from envs_mjx.base import Environment
-from mijax.config import Stage1Config
+from mijax.config import ConfigError, Stage1Config
 from mijax.losses.club import club_all_pairs, gaussian_fit
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
@@ -129,8 +129,8 @@ def optimizers(config: Stage1Config, updates: int) -> tuple[optax.GradientTransf
     step_size = optax.cosine_decay_schedule(config.learning_rate, updates)
     plain = optax.adam(step_size)
     names = {name: "phi" if name == "phi" else "others" for name in ENCODER_NETWORKS}
-    optimizer = optax.partition({"phi": optax.chain(plain, shrink(config.phi_shrinkage, step_size)), "others": plain}, names)
-    return optimizer, optax.adam(config.learning_rate)
+    shrinking = optax.chain(plain, shrink(config.phi_shrinkage, step_size))
+    return optax.partition({"phi": shrinking, "others": plain}, names), optax.adam(config.learning_rate)
 
 
 def shrink(strength: float, step_size: optax.Schedule) -> optax.GradientTransformation:
@@ -204,7 +204,8 @@ def features(problem: Problem, parameters: dict[str, Params], rows: TransitionTa
             return jnp.concatenate([z, local_features(encoder, weights, parameters[discriminator], x)], axis=-1)
 
         z, *local = jnp.split(encode(now, frames, index), 1 if discriminator is None else 2, axis=-1)
-        return z, encode(lambda x: encoder.apply({"params": frozen}, x), frames, next_index), local[0] if local else None
+        next_z = encode(lambda x: encoder.apply({"params": frozen}, x), frames, next_index)
+        return z, next_z, local[0] if local else None
 
     z_s, next_z_s, local_s = both(networks.phi, data.states, rows.state, rows.next_state, "phi",
                                   "discriminator_s" if config.lambda_dim_s > 0 else None)
@@ -303,7 +304,7 @@ def learn_representation(
 
     Raises:
         DivergenceError: a loss is no finite number.
-        ValueError: the data set is smaller than one batch.
+        ConfigError: the data set is smaller than one batch.
     """
     data_key, init_key, train_key = jax.random.split(key, 3)
     return train_on(collect(env, data_key, config.episodes), env, config, init_key, train_key, on_progress)
@@ -315,7 +316,8 @@ def train_on(
 ) -> tuple[Representation, History]:
     """Stage 1 on transitions that were collected elsewhere (demonstrations); see `learn_representation`."""
     if data.size < config.batch_size:
-        raise ValueError(f"stage 1: {data.size} transitions are fewer than --stage1.batch-size {config.batch_size}")
+        raise ConfigError(f"--stage1.batch-size: got {config.batch_size}, accepted: at most the {data.size} "
+                          f"transitions of --stage1.episodes {config.episodes}")
     problem = Problem(networks_for(env, config.features), config, data, *tabulate(data))
     state, epoch = initial_state(problem, init_key), make_epoch(problem)
     seen: list[dict[str, float]] = []

@@ -1,0 +1,263 @@
+"""Stage 1: data, encoders, training, the probe, files and the command."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs_mjx import registry
+from envs_mjx.base import ArraySpec
+from mijax import represent
+from mijax.config import ConfigError, Stage1Config
+from mijax.nets.encoders import Convolution, encoder_for, image_plan
+from mijax.representation import DivergenceError, encode_observation, encode_state, learn_representation
+from mijax.representation.dataset import Transitions, collect, tabulate
+from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
+from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
+from mijax.representation.train import encode, shrink
+
+SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return registry.make("heaven_hell")
+
+
+@pytest.fixture(scope="module")
+def data(env) -> Transitions:
+    return collect(env, jax.random.key(0), 20)
+
+
+@pytest.fixture(scope="module")
+def learnt(env):
+    return learn_representation(env, SMALL, jax.random.key(1))
+
+
+def test_transitions_follow_one_another_and_end_with_their_episode(data):
+    episode, terminal = np.asarray(data.episode), np.asarray(data.terminal)
+    same = episode[1:] == episode[:-1]
+    np.testing.assert_array_equal(np.asarray(data.next_state)[:-1][same], np.asarray(data.state)[1:][same])
+    np.testing.assert_array_equal(np.asarray(data.next_observation)[:-1][same], np.asarray(data.observation)[1:][same])
+    assert not terminal[:-1][same].any()
+    assert set(np.unique(episode)) == set(range(20))
+    assert np.bincount(episode).max() <= 50
+    np.testing.assert_array_equal(np.asarray(data.reward) != 0, terminal)
+    assert len(np.unique(np.asarray(data.states), axis=0)) == len(data.states) <= 28
+
+
+def test_the_table_of_distinct_transitions_gives_the_transitions_back(data):
+    table, row = tabulate(data)
+    assert table.size < data.size
+    for field in dataclasses.fields(table):
+        np.testing.assert_array_equal(np.asarray(getattr(table, field.name))[row], getattr(data, field.name))
+
+
+@pytest.mark.parametrize(("count", "rows"), [(10, 30), (60, 30), (60, 14), (200, 30)])
+def test_encoding_the_distinct_frames_is_encoding_all(count, rows):
+    frames = jax.random.normal(jax.random.key(0), (count, 3))
+    for high in (count, 5):  # many and few distinct frames in the batch
+        index = jax.random.randint(jax.random.key(1), (rows,), 0, high)
+        np.testing.assert_allclose(encode(jnp.sin, frames, index), jnp.sin(frames[index]), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("size", "kernel", "stride"), [(6, 2, 1), (11, 3, 1), (21, 8, 4), (9, 4, 4)])
+def test_convolutions_are_those_of_xla(size, kernel, stride):
+    x = jax.random.normal(jax.random.key(0), (2, size, size, 3))
+    module = Convolution(5, kernel, stride)
+    params = module.init(jax.random.key(1), x)
+    expected = jax.lax.conv_general_dilated(
+        x, params["params"]["kernel"], (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+    np.testing.assert_allclose(module.apply(params, x), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 3, 1), (6, 6, 2), (11, 11, 2), (30, 40, 3), (84, 84, 2)])
+def test_every_shape_has_an_encoder_and_its_first_block_leads_to_it(shape):
+    encoder = encoder_for(ArraySpec(shape), 32)
+    x = jnp.ones((2, *shape), jnp.uint8)
+    params = encoder.init(jax.random.key(0), x)
+    z = encoder.apply(params, x)
+    assert z.shape == (2, 32)
+    assert z.dtype == jnp.float32
+    h = encoder.apply(params, x, method="first_block")
+    np.testing.assert_allclose(encoder.apply(params, h, method="finish"), z, atol=1e-6)
+    np.testing.assert_allclose(encoder.apply(params, x[None]), z[None], atol=1e-6)
+
+
+def test_papers_networks_are_chosen_by_size():
+    assert [(b.channels, b.kernel, b.pool) for b in image_plan(6)] == [(64, 2, 1), (128, 2, 2), (256, 2, 1)]
+    assert [(b.channels, b.kernel, b.pool) for b in image_plan(11)] == [(64, 2, 2), (128, 2, 2), (256, 2, 1)]
+    assert [(b.channels, b.kernel, b.stride) for b in image_plan(84)] == [(32, 8, 4), (64, 4, 4), (64, 3, 1)]
+    with pytest.raises(ValueError, match="no encoder"):
+        encoder_for(ArraySpec((2, 3)), 4)
+
+
+def test_shrinking_stops_at_zero_and_spares_biases():
+    transform = shrink(0.5, lambda count: jnp.float32(0.2))
+    weights = {"kernel": jnp.array([[1.0, 0.05, -0.3]]), "bias": jnp.array([1.0])}
+    updates, _ = transform.update(jax.tree.map(jnp.zeros_like, weights), transform.init(weights), weights)
+    np.testing.assert_allclose(weights["kernel"] + updates["kernel"], [[0.9, 0.0, -0.2]], atol=1e-6)
+    np.testing.assert_array_equal(updates["bias"], [0.0])
+
+
+@pytest.mark.lenient
+def test_training_follows_its_key_alone_and_reports_progress(env, learnt):
+    epochs = []
+    again, history = learn_representation(env, SMALL, jax.random.key(1), lambda n, m: epochs.append((n, m["club"])))
+    other, _ = learn_representation(env, SMALL, jax.random.key(2))
+    assert [n for n, _ in epochs] == [1, 2]
+    assert history.metrics["club"][-1] == epochs[-1][1]
+    first = jax.tree.leaves(learnt[0])
+    assert all(np.array_equal(a, b) for a, b in zip(first, jax.tree.leaves(again), strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(first, jax.tree.leaves(other), strict=True))
+    assert history.metrics["loss"][-1] < history.metrics["loss"][0]
+
+
+@pytest.mark.lenient
+def test_images_train_in_both_ways_of_batching():
+    sphinx = registry.make("sphinx")
+    for batch_size in (20, 400):
+        config = Stage1Config(episodes=12, epochs=1, batch_size=batch_size, features=4)
+        representation, history = learn_representation(sphinx, config, jax.random.key(0))
+        assert history.updates >= 1
+        frames = jnp.zeros((2, 3, *sphinx.observation_spec.shape), jnp.uint8)
+        assert encode_observation(representation, sphinx, frames).shape == (2, 3, 4)
+
+
+@pytest.mark.lenient
+def test_divergence_is_one_line_that_names_the_loss(env):
+    with pytest.raises(DivergenceError, match=r"^stage 1: \w+ is (nan|inf|-inf) after epoch \d+; try .*learning-rate"):
+        learn_representation(env, dataclasses.replace(SMALL, learning_rate=1e30), jax.random.key(0))
+
+
+@pytest.mark.lenient
+def test_too_little_data_is_an_error(env):
+    with pytest.raises(ConfigError, match=r"at most the \d+ transitions"):
+        learn_representation(env, dataclasses.replace(SMALL, batch_size=100_000), jax.random.key(0))
+
+
+def test_moments_of_z_s_are_those_of_the_data(env, learnt):
+    representation = learnt[0]
+    data = collect(env, jax.random.split(jax.random.key(1), 3)[0], SMALL.episodes)
+    z = np.asarray(encode_state(representation, env, data.states), np.float64)[data.state]
+    np.testing.assert_allclose(representation.z_s_mean, z.mean(0), atol=1e-5)
+    np.testing.assert_allclose(representation.z_s_variance, z.var(0).sum(), rtol=1e-3)
+
+
+@dataclasses.dataclass
+class _Chosen:
+    """Parameters of an encoder without hidden layers between: z = x @ matrix."""
+
+    matrix: np.ndarray
+
+    def parameters(self, like: dict) -> dict:
+        """Passes (D,) inputs through two ReLU layers unharmed as x and -x."""
+        params = jax.tree.map(lambda a: np.zeros(a.shape, np.float32), like)
+        size = len(self.matrix)
+        for i in range(size):
+            params["blocks_0"]["kernel"][i, [2 * i, 2 * i + 1]] = 1, -1
+            params["blocks_1"]["kernel"][[2 * i, 2 * i + 1], [2 * i, 2 * i + 1]] = 1
+            params["output"]["kernel"][2 * i] = self.matrix[i]
+            params["output"]["kernel"][2 * i + 1] = -self.matrix[i]
+        return jax.tree.map(jnp.asarray, params)
+
+
+def _hand_made(learnt, leak: float):
+    """z_s = side + leak * x; z_o = (x, y)."""
+    z_s, z_o = np.zeros((3, 8), np.float32), np.zeros((3, 8), np.float32)
+    z_s[2, 0], z_s[0, 1] = 1, leak
+    z_o[0, 0] = z_o[1, 1] = 1
+    return learnt[0].replace(phi=_Chosen(z_s).parameters(learnt[0].phi), psi=_Chosen(z_o).parameters(learnt[0].psi),
+                             z_s_mean=jnp.zeros(8).at[7].set(1.0))
+
+
+@pytest.mark.lenient
+@pytest.mark.parametrize(("leak", "clean"), [(0.0, True), (1e-7, True), (1e-3, False), (1.0, False)])
+def test_probe_sees_a_leak_of_any_size_beyond_round_off(env, learnt, leak, clean):
+    report = probe(_hand_made(learnt, leak), env, SMALL, jax.random.key(5))
+    found = {(d.variable, d.source): d for d in report.decodings}
+    assert found["side", "z_s"].linear == 1.0
+    assert found["x", "z_o"].linear > 0.999
+    assert report.p1
+    assert report.p2 is clean, report.p2_failures
+    assert any("x leaks into z_s" in reason for reason in report.p2_failures) is not clean
+    assert ("P2 pass" in format_report(report)) is clean
+
+
+@pytest.mark.lenient
+def test_probe_reports_geometry_bonus_and_errors_as_plain_numbers(env, learnt):
+    report = probe(*(_hand_made(learnt, 0.0), env, SMALL, jax.random.key(5)), history=learnt[1])
+    np.testing.assert_allclose(report.geometry["cosine"], -1.0, atol=1e-5)
+    np.testing.assert_allclose(report.bonus["explained_variance"], 1.0, atol=1e-5)
+    np.testing.assert_allclose(report.bonus["cosine"], 1.0, atol=1e-5)
+    assert set(report.errors) == {"reward_r2", "next_z_s_error", "next_z_o_error", "club"}
+    assert json.loads(json.dumps(report.as_dict()))["p1_failures"] == list(report.p1_failures)
+
+
+def test_an_empty_or_constant_feature_space_has_no_directions():
+    fitted = np.arange(10) < 5
+    assert whiten(np.full((10, 3), 2.0, np.float32), fitted).shape == (10, 0)
+    assert whiten(np.zeros((10, 3), np.float32), fitted).shape == (10, 0)
+    z = np.stack([np.arange(10.0), 100 * ROUND_OFF * (np.arange(10) % 3)], axis=1)
+    np.testing.assert_allclose(whiten(z, fitted)[fitted].var(0), 1.0)
+
+
+def test_thresholds_of_presence_and_absence():
+    base = Decoding("side", "z_o", True, "accuracy", linear=0.59, mlp=0.5, chance=0.5)
+    assert base.is_absent
+    assert not dataclasses.replace(base, mlp=0.62).is_absent
+    assert dataclasses.replace(base, mlp=1.0).is_present
+
+
+def test_a_representation_comes_back_from_its_folder(env, learnt, tmp_path):
+    save_representation(learnt[0], env, tmp_path / "a")
+    loaded = load_representation(tmp_path / "a", env)
+    for a, b in zip(jax.tree.leaves(learnt[0]), jax.tree.leaves(loaded), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not list((tmp_path / "a").glob("*.part"))
+
+
+def test_bad_folders_are_named_in_one_line(env, learnt, tmp_path):
+    folder = tmp_path / "a"
+    with pytest.raises(RepresentationError, match="no representation there"):
+        load_representation(folder, env)
+    save_representation(learnt[0], env, folder)
+    with pytest.raises(RepresentationError, match="domain is heaven_hell"):
+        load_representation(folder, registry.make("sphinx"))
+    content = (folder / PARAMETERS_FILE).read_bytes()
+    for damaged in (content[: len(content) // 2], b"", b"garbage"):
+        (folder / PARAMETERS_FILE).write_bytes(damaged)
+        with pytest.raises(RepresentationError, match=r"is damaged \(\w+\)$"):
+            load_representation(folder, env)
+    (folder / PARAMETERS_FILE).unlink()
+    with pytest.raises(RepresentationError, match="is missing"):
+        load_representation(folder, env)
+    (folder / "representation.json").write_text("{")
+    with pytest.raises(RepresentationError, match="damaged"):
+        load_representation(folder, env)
+
+
+@pytest.mark.lenient
+def test_the_command_learns_probes_and_keeps(tmp_path, capsys):
+    options = ["--out", str(tmp_path / "run"), "--seeds", "3,", "--stage1.epochs", "1", "--stage1.episodes", "20",
+               "--stage1.heldout-episodes", "10", "--stage1.batch-size", "200"]
+    assert represent.main(["--domain", "heaven_hell", *options]) == 0
+    shown = capsys.readouterr().out
+    assert "P1" in shown
+    assert "of 1 representations pass" in shown
+    folder = tmp_path / "run" / "seed_3" / "representation"
+    assert json.loads((folder / "probe.json").read_text())["domain"] == "heaven_hell"
+    load_representation(folder, registry.make("heaven_hell"))
+    assert represent.main(["--domain", "heaven_hell", *options]) == 1
+    assert "already holds a run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [["--domain", "nowhere"], ["--seeds", "x"], ["--seeds", "0"]])
+def test_the_command_refuses_in_one_line(options, tmp_path, capsys):
+    assert represent.main([*options, "--out", str(tmp_path / "run")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1

@@ -2,26 +2,21 @@
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import sys
 from collections.abc import Sequence
 from typing import Annotated
 
-import jax
 import tyro
 
 import configs
 from envs_mjx import registry
-from envs_mjx.base import Environment
 from mijax import runtime, stage1
-from mijax.config import ConfigError, Stage1Config, require
-from mijax.metrics import ProgressDisplay, RunError, RunFolder
-from mijax.representation import DivergenceError, learn_representation
-from mijax.representation.probe import ProbeReport, format_report, probe
-from mijax.representation.storage import RepresentationError, save_representation, write_atomically
+from mijax.config import ConfigError, Stage1Config, parse_seeds
+from mijax.metrics import RunError, RunFolder
+from mijax.representation import DivergenceError
+from mijax.representation.storage import RepresentationError
 
-PROBE_FILE = "probe.json"
 USER_ERRORS = (ConfigError, RunError, RepresentationError, DivergenceError, registry.UnknownDomain,
                registry.ContractError, OSError)
 """What a user can mend: shown as one line."""
@@ -49,27 +44,6 @@ def parse(arguments: Sequence[str]) -> RepresentOptions:
     return tyro.cli(RepresentOptions, default=default, args=list(arguments), prog="python -m mijax.represent")
 
 
-def represent(env: Environment, config: Stage1Config, seed: int, run: RunFolder) -> ProbeReport:
-    """Learn, probe and keep one seed's representation."""
-    key = stage1.representation_key(seed)
-    with ProgressDisplay(f"stage 1, seed {seed}", config.epochs, unit="epochs") as progress:
-        representation, history = learn_representation(env, config, key, on_progress=progress.update)
-    report = probe(representation, env, config, probe_key(seed), history)
-    folder = stage1.folder_of(run, seed)
-    save_representation(representation, env, folder)
-    timing = {"updates": history.updates, "updates_per_second": history.updates_per_second,
-              "compile_seconds": history.compile_seconds, "seconds": history.seconds}
-    write_atomically(folder / PROBE_FILE, json.dumps(report.as_dict() | timing, indent=2).encode())
-    print(f"seed {seed}: {history.updates} updates in {history.compile_seconds + history.seconds:.0f} s "
-          f"({history.updates_per_second:.0f}/s), kept in {folder}\n{format_report(report)}", flush=True)
-    return report
-
-
-def probe_key(seed: int) -> jax.Array:
-    """The key of a seed's held-out episodes, which training never sees."""
-    return jax.random.fold_in(stage1.representation_key(seed), 1)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 when all went well, also if a representation fails its probe."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
@@ -79,22 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name = f"{options.domain.replace(':', '.')}-representation"
         stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
         run = RunFolder.create(options.out or pathlib.Path("runs") / name, stored)
-        passed = [report.p1 and report.p2 for report in (represent(env, options.stage1, s, run) for s in seeds)]
+        reports = [stage1.learn(run, env, options.stage1, seed, print) for seed in seeds]
     except USER_ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(f"{sum(passed)} of {len(passed)} representations pass P1 and P2")
+    print(f"{sum(report.p1 and report.p2 for report in reports)} of {len(reports)} representations pass P1 and P2")
     return 0
-
-
-def parse_seeds(text: str) -> tuple[int, ...]:
-    """`5` -> (0, 1, 2, 3, 4); `3,7` -> (3, 7); `3,` -> (3,)."""
-    parts = [part.strip() for part in text.split(",") if part.strip()]
-    require(bool(parts) and all(part.isdigit() for part in parts), "seeds", text, "a number such as 5, or a list 3,7")
-    numbers = tuple(map(int, parts))
-    require("," in text or numbers[0] >= 1, "seeds", text, "at least one seed")
-    require(len(set(numbers)) == len(numbers), "seeds", text, "different seeds")
-    return numbers if "," in text else tuple(range(numbers[0]))
 
 
 if __name__ == "__main__":

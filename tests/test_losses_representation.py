@@ -37,7 +37,8 @@ def test_weighted_rows_are_repeated_rows(gaussians):
     rows = tuple(jnp.asarray(a) for a in gaussians)
     repeated = tuple(jnp.asarray(np.repeat(a, repeats, axis=0)) for a in gaussians)
     for loss in (club_all_pairs, gaussian_fit):
-        np.testing.assert_allclose(loss(*rows, weight)[0], loss(*repeated)[0], rtol=1e-5)
+        np.testing.assert_allclose(loss(rows[0], rows[1], rows[2], weight)[0],
+                                   loss(repeated[0], repeated[1], repeated[2])[0], rtol=1e-5)
     r, terminal = jnp.asarray(gaussians[0][:, 0]), jnp.arange(7) % 3 == 0
     ends = jnp.asarray(np.repeat(np.asarray(terminal), repeats))
     np.testing.assert_allclose(reward_loss(rows[1][:, 0], r, weight)[0],
@@ -52,12 +53,13 @@ def test_gaussian_fit_is_the_negative_log_likelihood(gaussians):
 
 
 def test_sampled_club_is_the_loop_and_averages_to_all_pairs(gaussians):
-    z, mean, log_variance = map(jnp.asarray, gaussians)
-    shifts = [club_sampled(z, mean, log_variance, jnp.roll(jnp.arange(7), k))[0] for k in range(7)]
+    z, mean, log_variance = gaussians
+    arrays = jnp.asarray(z), jnp.asarray(mean), jnp.asarray(log_variance)
+    shifts = [club_sampled(*arrays, jnp.roll(jnp.arange(7), k))[0] for k in range(7)]
     expected = np.mean([_log_density(z[i], mean[i], log_variance[i])
                         - _log_density(z[(i - 2) % 7], mean[i], log_variance[i]) for i in range(7)])
     np.testing.assert_allclose(shifts[2], expected, rtol=1e-5)
-    np.testing.assert_allclose(np.mean(shifts), club_all_pairs(z, mean, log_variance)[0], rtol=1e-4)
+    np.testing.assert_allclose(np.mean(shifts), club_all_pairs(*arrays)[0], rtol=1e-4)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])

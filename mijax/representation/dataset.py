@@ -99,13 +99,13 @@ def flatten(episodes: Episodes) -> Transitions:
     seen = np.arange(horizon + 1) <= e.length[:, None]
     states, state_index = _distinct(e.state, seen)
     observations, observation_index = _distinct(e.observation, seen)
-    columns = Transitions(
-        states=states, observations=observations, state=state_index[row, step],
-        observation=observation_index[row, step], action=e.action[row, step], reward=e.reward[row, step],
-        next_state=state_index[row, step + 1], next_observation=observation_index[row, step + 1],
-        terminal=e.terminated[row, step], ground_truth=e.ground_truth[row, step], reveals=e.reveals[row, step],
-        episode=row.astype(np.int32))
-    return jax.tree.map(jnp.asarray, columns)
+    columns: dict[str, np.ndarray] = {
+        "states": states, "observations": observations,
+        "state": state_index[row, step], "next_state": state_index[row, step + 1],
+        "observation": observation_index[row, step], "next_observation": observation_index[row, step + 1],
+        "action": e.action[row, step], "reward": e.reward[row, step], "terminal": e.terminated[row, step],
+        "ground_truth": e.ground_truth[row, step], "reveals": e.reveals[row, step], "episode": row.astype(np.int32)}
+    return Transitions(**{name: jnp.asarray(column) for name, column in columns.items()})
 
 
 def _distinct(frames: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

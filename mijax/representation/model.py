@@ -1,6 +1,7 @@
 """The networks of stage 1 (paper Figs. 23 to 28): phi, psi, the dynamics model, the discriminators and CLUB's q."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,10 +64,14 @@ class Networks:
         return jnp.zeros((size, spec.num if isinstance(spec, DiscreteActions) else spec.size), jnp.float32)
 
 
+def evaluate(module: nn.Module, parameters: Params, *inputs: jax.Array, method: str | None = None) -> Any:
+    """What the module gives; Flax types it as possibly a tuple with mutated variables, which these never return."""
+    return module.apply({"params": parameters}, *inputs, method=method)
+
+
 def local_features(encoder: Encoder, parameters: Params, discriminator: Params, x: jax.Array) -> jax.Array:
     """z^l of Fig. 28, (..., F): the discriminator's own layers on top of the encoder's first block."""
-    h = encoder.apply({"params": parameters}, x, method="first_block")
-    return encoder.apply({"params": discriminator}, h, method="finish")
+    return evaluate(encoder, discriminator, evaluate(encoder, parameters, x, method="first_block"), method="finish")
 
 
 def networks_for(env: Environment, features: int) -> Networks:
@@ -82,7 +87,7 @@ def init_parameters(networks: Networks, key: jax.Array, state: jax.Array, observ
     z = jnp.zeros((1, networks.phi.features), jnp.float32)
 
     def discriminator(encoder: Encoder, parameters: Params, init_key: jax.Array, x: jax.Array) -> Params:
-        h = encoder.apply({"params": parameters}, x, method="first_block")
+        h = evaluate(encoder, parameters, x, method="first_block")
         return encoder.init(init_key, h, method="finish")["params"]
 
     phi = networks.phi.init(keys[0], state)["params"]

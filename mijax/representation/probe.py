@@ -17,7 +17,7 @@ from envs_mjx.base import Environment, Variable
 from mijax.config import Stage1Config
 from mijax.losses.club import club_all_pairs
 from mijax.representation.dataset import Transitions, collect
-from mijax.representation.model import networks_for
+from mijax.representation.model import evaluate, networks_for
 from mijax.representation.train import History, encode_frames, standardize
 from mijax.types import Representation
 
@@ -246,10 +246,10 @@ def _errors(
 ) -> dict[str, float]:
     """Of the dynamics model and of CLUB's estimator, on held-out transitions; errors in fractions of the variance."""
     networks = networks_for(env, z_s.shape[-1])
-    reward, guess_s, guess_o = networks.dynamics.apply(
-        {"params": history.dynamics}, z_s, z_o, networks.encode_action(data.action))
+    reward, guess_s, guess_o = evaluate(
+        networks.dynamics, history.dynamics, z_s, z_o, networks.encode_action(data.action))
     weight = jnp.full(data.size, 1 / data.size, jnp.float32)
-    estimate = networks.estimator.apply({"params": history.estimator}, standardize(z_s, weight))
+    mean, log_variance = evaluate(networks.estimator, history.estimator, standardize(z_s, weight))
     goes_on = ~np.asarray(data.terminal)
 
     def error(guess: jax.Array, actual: jax.Array, rows: np.ndarray) -> float:
@@ -261,7 +261,7 @@ def _errors(
         "reward_r2": 1 - error(reward, data.reward, np.ones(data.size, bool)),
         "next_z_s_error": error(guess_s, next_z_s, goes_on),
         "next_z_o_error": error(guess_o, next_z_o, goes_on),
-        "club": float(club_all_pairs(standardize(z_o, weight), *estimate, weight)[0]),
+        "club": float(club_all_pairs(standardize(z_o, weight), mean, log_variance, weight)[0]),
     }
 
 
@@ -294,7 +294,8 @@ def _verdicts(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Reasons why P1 and P2 fail."""
     if not decodings:
-        return (("the environment declares no variables to decode",),) * 2
+        nothing = ("the environment declares no variables to decode",)
+        return nothing, nothing
     p1 = [f"{d.variable} is not decoded from both ({d.measure} {d.best:.2f} < {DECODED})"
           for d in decodings if d.source == "both" and not d.is_present]
     if errors.get("reward_r2", 1.0) < REWARD_DECODED:

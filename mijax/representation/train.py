@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
 from mijax.nets.encoders import Encoder
 from mijax.representation.dataset import Transitions, TransitionTable, collect, tabulate
-from mijax.representation.model import Networks, init_parameters, local_features, networks_for
+from mijax.representation.model import Networks, evaluate, init_parameters, local_features, networks_for
 from mijax.types import Metrics, Params, Representation
 
 ENCODER_NETWORKS = ("phi", "psi", "dynamics", "discriminator_s", "discriminator_o")
@@ -140,11 +141,14 @@ def shrink(strength: float, step_size: optax.Schedule) -> optax.GradientTransfor
     survives only if its gradient, in units of its own root mean square, keeps asking for it with more than `strength`.
     """
 
-    def init(parameters: optax.Params) -> jax.Array:
-        del parameters
+    def init(params: optax.Params) -> jax.Array:
+        del params
         return jnp.zeros((), jnp.int32)
 
-    def update(updates: optax.Updates, count: jax.Array, parameters: optax.Params | None = None) -> tuple:
+    def update(
+        updates: optax.Updates, state: optax.OptState, params: optax.Params | None = None
+    ) -> tuple[optax.Updates, optax.OptState]:
+        count = cast(jax.Array, state)
         threshold = strength * step_size(count)
 
         def pull(update: jax.Array, weight: jax.Array) -> jax.Array:
@@ -153,7 +157,7 @@ def shrink(strength: float, step_size: optax.Schedule) -> optax.GradientTransfor
             moved = weight + update
             return jnp.sign(moved) * jnp.maximum(jnp.abs(moved) - threshold, 0.0) - weight
 
-        return jax.tree.map(pull, updates, parameters), count + 1
+        return jax.tree.map(pull, updates, params), count + 1
 
     return optax.GradientTransformation(init, update)
 
@@ -198,13 +202,13 @@ def features(problem: Problem, parameters: dict[str, Params], rows: TransitionTa
         frozen = jax.lax.stop_gradient(weights)
 
         def now(x: jax.Array) -> jax.Array:
-            z = encoder.apply({"params": weights}, x)
+            z = evaluate(encoder, weights, x)
             if discriminator is None:
                 return z
             return jnp.concatenate([z, local_features(encoder, weights, parameters[discriminator], x)], axis=-1)
 
         z, *local = jnp.split(encode(now, frames, index), 1 if discriminator is None else 2, axis=-1)
-        next_z = encode(lambda x: encoder.apply({"params": frozen}, x), frames, next_index)
+        next_z = encode(lambda x: evaluate(encoder, frozen, x), frames, next_index)
         return z, next_z, local[0] if local else None
 
     z_s, next_z_s, local_s = both(networks.phi, data.states, rows.state, rows.next_state, "phi",
@@ -231,9 +235,9 @@ def encoder_loss(
     config, networks, rows, weight = problem.config, problem.networks, batch.rows, batch.weight
     f = features(problem, parameters, rows)
     fit = fit_estimator(fit, problem, batch, f.z_s, f.z_o, optimizer)
-    reward, predicted_z_s, predicted_z_o = networks.dynamics.apply(
-        {"params": parameters["dynamics"]}, f.z_s, f.z_o, networks.encode_action(rows.action))
-    mean, log_variance = networks.estimator.apply({"params": fit.parameters}, standardize(f.z_s, weight))
+    reward, predicted_z_s, predicted_z_o = evaluate(
+        networks.dynamics, parameters["dynamics"], f.z_s, f.z_o, networks.encode_action(rows.action))
+    mean, log_variance = evaluate(networks.estimator, fit.parameters, standardize(f.z_s, weight))
     terms = {
         "reward_loss": (config.lambda_r, reward_loss(reward, rows.reward, weight)[0]),
         "z_s_loss": (config.lambda_s, next_feature_loss(predicted_z_s, f.next_z_s, rows.terminal, weight)[0]),
@@ -256,7 +260,8 @@ def fit_estimator(
     z_s, z_o = (jax.lax.stop_gradient(standardize(z, batch.weight)) for z in (z_s, z_o))
 
     def loss(parameters: Params) -> jax.Array:
-        return gaussian_fit(z_o, *problem.networks.estimator.apply({"params": parameters}, z_s), batch.weight)[0]
+        mean, log_variance = evaluate(problem.networks.estimator, parameters, z_s)
+        return gaussian_fit(z_o, mean, log_variance, batch.weight)[0]
 
     def update(fit: EstimatorState, _: None) -> tuple[EstimatorState, None]:
         step, optimizer_state = optimizer.update(jax.grad(loss)(fit.parameters), fit.optimizer)
@@ -284,7 +289,8 @@ def make_epoch(problem: Problem) -> Callable[[TrainState, jax.Array], tuple[Trai
         gradients, (fit, metrics) = jax.grad(encoder_loss, has_aux=True)(
             state.parameters, state.estimator, problem, problem.batch(chosen), estimator_optimizer)
         step, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
-        return TrainState(optax.apply_updates(state.parameters, step), optimizer_state, fit), metrics
+        parameters = cast(dict[str, Params], optax.apply_updates(state.parameters, step))
+        return TrainState(parameters, optimizer_state, fit), metrics
 
     @jax.jit
     def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
@@ -359,4 +365,4 @@ def _representation(problem: Problem, state: TrainState) -> Representation:
 @functools.partial(jax.jit, static_argnums=0)
 def encode_frames(encoder: Encoder, parameters: Params, frames: jax.Array) -> jax.Array:
     """(M, F) features of (M, ...) frames."""
-    return encoder.apply({"params": parameters}, frames)
+    return evaluate(encoder, parameters, frames)

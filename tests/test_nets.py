@@ -155,7 +155,7 @@ def change(tokens: Tokens, where: np.ndarray) -> Tokens:
     return tokens.replace(  # pyright: ignore[reportAttributeAccessIssue]
         frames=jnp.where(mask.reshape(-1, 1), 9.0, tokens.frames),
         previous_action=jnp.where(mask, 2 - jnp.maximum(tokens.previous_action, 0), tokens.previous_action),
-        z_s=jnp.where(mask[..., None], 7.0, tokens.z_s),
+        z_s=None if tokens.z_s is None else jnp.where(mask[..., None], 7.0, tokens.z_s),
     )
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from envs_mjx import registry
 from envs_mjx.grid.world import GridWorld
-from mijax.packing import distinct, first_fit, gather_rows, one_per_row, row_choices
+from mijax.packing import distinct, first_fit, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, StepRecord, finish, init_replay, sample_episodes, write
 
 HORIZON, NUM_ENVS, FEATURES = 4, 3, 2
@@ -112,12 +112,22 @@ def test_every_finished_episode_is_sampled_and_no_open_one(lengths: list[int]):
 
 
 def test_sampling_is_uniform_over_episodes_whatever_their_length():
-    replay = collect([1, 4, 1, 4, 4, 4, 4] + [4] * 30, NUM_ENVS + 2, 5).replay
+    replay = collect([1, 4, 1, 4, 4, 4, 4] + [4] * 30, 4, 5).replay
     lengths = [steps for _, steps in stored(replay)]
     assert set(lengths) == {1, 4}
     slots = np.asarray(sample(replay, jax.random.key(0), 10_000))
-    counts = np.bincount(slots)[np.asarray(replay.finished)[: len(lengths)]]
+    counts = np.bincount(slots)[np.asarray(replay.finished)]
     np.testing.assert_allclose(counts / 10_000, 1 / len(lengths), atol=4 * np.sqrt(0.25 / 10_000))
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 12])
+def test_the_halves_of_a_batch_come_from_two_folds_of_the_replay(steps: int):
+    """Of 1, 2, 3 and 5 episodes: those at even places of the ring, and those at odd ones."""
+    replay = collect([1, 9, 9] + [1] * 60, NUM_ENVS + 2, steps).replay
+    places = np.asarray(replay.finished)[: int(replay.count)].tolist()
+    halves = np.asarray(sample(replay, jax.random.key(0), 256)).reshape(2, -1)
+    assert set(halves[0].tolist()) == set(places[::2])
+    assert set(halves[1].tolist()) == set(places[1::2] or places)
 
 
 def test_all_environments_end_at_once_in_the_smallest_replay():
@@ -161,6 +171,15 @@ def test_first_fit(lengths: list[int]):
     assert taken.sum() == sum(lengths)
     assert taken.any(axis=1).tolist() == [row < int(layout.num_rows) for row in range(BATCH)]
     assert list(zip(layout.row.tolist(), layout.offset.tolist(), strict=True)) == first_fit_reference(lengths)
+
+
+def test_folds_are_packed_into_rows_of_their_own():
+    lengths = [4, 6, 10, 5, 3, 3, 3, 1]
+    layout = fit_folds(jnp.array(lengths, jnp.int32), ROW)
+    assert int(layout.num_rows) == 3
+    stacked = stack_folds(layout, 3)
+    assert stacked.row.tolist() == [1, 1, 0, 2, 3, 3, 3, 3]
+    assert stacked.offset.tolist() == [6, 0, 0, 0, 0, 3, 6, 9]
 
 
 @pytest.mark.parametrize("batch", [1, 2, 4, 7, 64])

@@ -37,7 +37,7 @@ class ConvBlock:
 class Convolution(nn.Module):
     """A convolution without padding, written as one matrix product: (..., rows, columns, C) -> (..., r, c, channels).
 
-    XLA's own convolutions are many times slower on a CPU inside a scan (Sphinx: 5 against 100 updates/s, measured).
+    XLA's own convolutions are many times slower on a CPU inside a scan (Sphinx: 5 against 50 updates/s, measured).
     `kernel` must be a multiple of `stride`: pixels are first gathered in blocks of stride x stride.
     """
 

@@ -32,7 +32,8 @@ class Checkpoints:
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self._manager = ocp.CheckpointManager(self.path, options=options)
+            handler = ocp.StandardCheckpointHandler()  # told in advance: a new process has nothing else to read with
+            self._manager = ocp.CheckpointManager(self.path, options=options, item_handlers=handler)
         except (OSError, ValueError) as error:
             raise RunError(f"{self.path}: {_one_line(error)}") from error
 

@@ -6,6 +6,7 @@ devices, checkpoints and logging are wrapped around these two functions.
 """
 
 import dataclasses
+import functools
 from typing import cast
 
 import jax
@@ -16,7 +17,7 @@ from envs_mjx.base import Environment
 from mijax.agents.dqn import DQN, AgentState, make_agent
 from mijax.config import Config
 from mijax.nets.encoders import encoder_for
-from mijax.packing import first_fit, gather_rows, one_per_row, row_choices
+from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, init_replay, sample_episodes, write
 from mijax.rollout import Episodes, EpisodeTotals, Labeller, collect_step, evaluate, record_of, start_episodes
 from mijax.types import Metrics, Representation
@@ -142,18 +143,18 @@ class Learner:
         max_frames = self.env.max_distinct_observations(batch)
         key_sample, key_loss = jax.random.split(key)
         slots = sample_episodes(replay, key_sample, batch)
-        choices = row_choices(batch) if self.pack else (batch,)
-        row_length = replay.data.reward.shape[1]
-        layout = first_fit(replay.length[slots], row_length) if self.pack else one_per_row(batch)
+        if not self.pack:
+            tokens = gather_rows(replay, slots, one_per_row(batch), batch, max_frames)
+            return self.agent.update(agent, tokens, representation, key_loss)
+        layout = fit_folds(replay.length[slots], replay.data.reward.shape[1])
+        choices = row_choices(batch // 2)
 
         def with_rows(rows: int) -> tuple[AgentState, Metrics]:
-            tokens = gather_rows(replay, slots, layout, rows, max_frames)
+            tokens = gather_rows(replay, slots, stack_folds(layout, rows), 2 * rows, max_frames)
             return self.agent.update(agent, tokens, representation, key_loss)
 
-        if len(choices) == 1:
-            return with_rows(batch)
         branch = jnp.searchsorted(jnp.asarray(choices), layout.num_rows)
-        return jax.lax.switch(branch, [lambda rows=rows: with_rows(rows) for rows in choices])
+        return jax.lax.switch(branch, [functools.partial(with_rows, rows) for rows in choices])
 
 
 def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:

@@ -4,6 +4,8 @@ A trained Heaven-Hell episode fills 15 of 51 tokens. Episodes are laid one after
 first fit of the longest needs; segments and positions keep them apart, so the result does not depend on the packing.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -36,14 +38,26 @@ def first_fit(length: jax.Array, row_length: int) -> Layout:
     return Layout(row[back], offset[back], jnp.max(row) + 1)
 
 
+def fit_folds(length: jax.Array, row_length: int) -> Layout:
+    """`first_fit` of each half of (B,) episodes by itself: `row` counts within the half, `num_rows` is the larger."""
+    halves = jax.vmap(first_fit, in_axes=(0, None))(length.reshape(2, -1), row_length)
+    return Layout(halves.row.reshape(-1), halves.offset.reshape(-1), jnp.max(halves.num_rows))
+
+
+def stack_folds(layout: Layout, rows: int) -> Layout:
+    """Lay the second half of the episodes below `rows` rows of the first."""
+    fold = jnp.arange(layout.row.shape[0], dtype=jnp.int32) * 2 // layout.row.shape[0]
+    return dataclasses.replace(layout, row=layout.row + rows * fold)
+
+
 def one_per_row(num: int) -> Layout:
     """Every episode in a row of its own: no packing."""
     return Layout(jnp.arange(num, dtype=jnp.int32), jnp.zeros((num,), jnp.int32), jnp.asarray(num, jnp.int32))
 
 
-def row_choices(batch: int) -> tuple[int, ...]:
-    """The static numbers of rows an update is compiled for."""
-    return tuple(sorted({-(-batch * eighths // 8) for eighths in (2, 3, 5, 8)}))
+def row_choices(episodes: int) -> tuple[int, ...]:
+    """The static numbers of rows that so many episodes may be packed into."""
+    return tuple(sorted({-(-episodes * eighths // 8) for eighths in (3, 5, 8)}))
 
 
 def gather_rows(replay: Replay, slots: jax.Array, layout: Layout, rows: int, max_frames: int | None) -> Tokens:

@@ -81,6 +81,12 @@ def finish(replay: Replay, done: jax.Array, length: jax.Array) -> Replay:
 
 
 def sample_episodes(replay: Replay, key: jax.Array, batch: int) -> jax.Array:
-    """(batch,) int32 slots of finished episodes, uniform with replacement whatever their length."""
+    """(batch,) int32 slots of finished episodes, uniform with replacement whatever their length.
+
+    The first half of the batch comes from episodes at even places of the ring and the second half from those at odd
+    ones, for as long as an episode lives: two folds, so that a model fitted on one can be tried on the other.
+    """
     number = jnp.minimum(replay.count, replay.capacity)
-    return replay.finished[jax.random.randint(key, (batch,), 0, number)]
+    fold = jnp.arange(batch) * 2 // batch
+    place = 2 * jax.random.randint(key, (batch,), 0, jnp.maximum((number + 1 - fold) // 2, 1)) + fold
+    return replay.finished[jnp.minimum(place, number - 1)]

@@ -3,9 +3,11 @@
 Letters: E environments, R packed rows, L tokens per row, N frames, A actions, F features.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 Params = Any
@@ -22,6 +24,10 @@ class Representation:
     psi: Params  # observation encoder, o -> z_o
     z_s_mean: jax.Array  # (F,)  mean of z_s over the training set
     z_s_variance: jax.Array  # ()  Tr Var(z_s) over the training set: the unit of the bonus and of the auxiliary loss
+
+    def destandardise(self, z: jax.Array) -> jax.Array:
+        """(..., F) network outputs of unit scale -> (..., F) predictions of z_s: no head has to learn its offset."""
+        return jnp.broadcast_to(self.z_s_mean, z.shape) + jnp.sqrt(self.z_s_variance) * z
 
 
 @struct.dataclass
@@ -40,3 +46,17 @@ class Tokens:
     segment: jax.Array  # (R, L) int32, which episode of the row, from 1; 0 is padding
     position: jax.Array  # (R, L) int32, step within the episode
     z_s: jax.Array | None  # (R, L, F) phi(s_t), or None when the agent does not use it
+
+    def folds(self) -> "tuple[Tokens, Tokens]":
+        """The upper and the lower half of the rows: of a batch of `sample_episodes`, its two folds."""
+        rows, length = self.segment.shape
+        halves = []
+        for part in (slice(None, rows // 2), slice(rows // 2, None)):
+            half = jax.tree.map(lambda x, part=part: x[part], dataclasses.replace(self, frames=None, frame=None))
+            if self.frame is None:
+                own = self.frames.reshape(rows, length, *self.frames.shape[1:])[part]
+                half = dataclasses.replace(half, frames=own.reshape(-1, *self.frames.shape[1:]))
+            else:
+                half = dataclasses.replace(half, frames=self.frames, frame=self.frame[part])
+            halves.append(half)
+        return halves[0], halves[1]

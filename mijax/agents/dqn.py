@@ -21,7 +21,7 @@ from mijax.types import Metrics, Params, Representation, Tokens
 class AgentState:
     """Everything that learning changes."""
 
-    params: Params  # {"agent": ..., "f": ...}
+    params: Params  # {"agent": ..., "f": [one per fold]}
     target: Params  # the agent's moving average: bootstraps and, being steadier, acts greedily in evaluations
     optimizer: Any  # Adam's moments
     updates: jax.Array  # () int32
@@ -46,7 +46,7 @@ class DQN:
             agent["bottom"] = cast(Representation, representation).psi
         params: dict[str, Params] = {"agent": agent}
         if self.information_model is not None:
-            params["f"] = self.information_model.init(key_f, tokens)["params"]
+            params["f"] = [self.information_model.init(key, tokens)["params"] for key in jax.random.split(key_f, self.config.information.folds)]
         target = jax.tree.map(jnp.copy, params["agent"])
         return AgentState(params, target, self.optimizer.init(params), jnp.zeros((), jnp.int32))
 
@@ -101,8 +101,16 @@ class DQN:
         q_select = q if self._exact else self._clean(self.network, params["agent"], tokens)[0]
         q_target, _ = self._clean(self.network, target, tokens)
         bonus, loss, metrics = jnp.zeros_like(tokens.reward), jnp.zeros(()), {}
+        if predicted is not None:
+            scale = cast(Representation, representation)
+            loss_k, parts = info.prediction_mse(
+                scale.destandardise(predicted), cast(jax.Array, tokens.z_s), tokens.segment > 0, scale.z_s_variance)
+            loss += self.config.information.auxiliary_weight * loss_k
+            metrics |= {"loss/auxiliary": loss_k, "auxiliary/explained": parts["explained"]}
         if self.information_model is not None:
-            loss, bonus, metrics = self._information(params["f"], predicted, tokens, representation, key_f)
+            loss_f, bonus, parts = self._information(params["f"], tokens, representation, key_f)
+            loss += loss_f
+            metrics |= parts
         loss_td, parts = self._td(q, q_select, q_target, bonus, tokens)
         return loss + loss_td, metrics | parts
 
@@ -133,26 +141,33 @@ class DQN:
         return module.apply({"params": params}, tokens)
 
     def _information(
-        self, params: Params, predicted: Any, tokens: Tokens, representation: Any, key: jax.Array
+        self, params: Params, tokens: Tokens, representation: Any, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, Metrics]:
-        """f's loss plus the weighted auxiliary loss, and (R, L) the weighted bonus for arriving at each token.
+        """f's loss, and (R, L) the weighted bonus for arriving at each token.
 
+        Two models f, each trained on one fold of the episodes; the bonus of an episode comes from the one that never
+        saw it. A single f learns the episodes of the replay by heart: at step 45 of episodes without any information it
+        explained 0.83 of z_s (measured, Heaven-Hell, 12 000 steps), and the bonus then pays for wandering about.
         The bonus of an episode's first token is meaningless; no target uses it.
         """
         options, variance, z_s = self.config.information, representation.z_s_variance, cast(jax.Array, tokens.z_s)
         real = tokens.segment > 0
-        f = self._apply(self.information_model, params, tokens, key)
+        folds = tokens.folds() if len(params) == 2 else (tokens,)
+        keys = jax.random.split(key, len(params))
+        f = representation.destandardise(jnp.concatenate([
+            self._apply(self.information_model, *arguments) for arguments in zip(params, folds, keys, strict=True)]))
         loss_f, parts_f = info.prediction_mse(f, z_s, real, variance)
-        loss_k, parts_k = info.prediction_mse(predicted, z_s, real, variance)
-        f_t = jax.lax.stop_gradient(f if self._exact else self._clean(self.information_model, params, tokens))
+        f_t = jnp.concatenate([
+            self._clean(self.information_model, *arguments) for arguments in zip(params[::-1], folds, strict=True)])
+        f_t = jax.lax.stop_gradient(representation.destandardise(f_t))
+        _, parts_t = info.prediction_mse(f_t, z_s, real, variance)
         f_tm1 = jnp.roll(f_t, 1, axis=1)
         if options.intrinsic_form == "cosine":
             bonus = info.cosine_bonus(z_s, f_t, f_tm1)
         else:
             bonus = info.explained_variance_bonus(z_s, f_t, f_tm1, variance)
-        metrics = {"loss/f": loss_f, "loss/auxiliary": loss_k, "f/explained": parts_f["explained"],
-                   "auxiliary/explained": parts_k["explained"]}
-        return loss_f + options.auxiliary_weight * loss_k, options.intrinsic_weight * bonus, metrics
+        metrics = {"loss/f": loss_f, "f/explained": parts_f["explained"], "f/explained_unseen": parts_t["explained"]}
+        return loss_f, options.intrinsic_weight * bonus, metrics
 
     def _td(
         self, q: jax.Array, q_select: jax.Array, q_target: jax.Array, bonus: jax.Array, tokens: Tokens
@@ -186,7 +201,9 @@ def make_agent(env: Environment, config: Config) -> DQN:
     network = TwoBranchQ(
         history, env.observation_spec, config.stage1.features, bottom_psi=declaration.uses_z_s,
         predicts_state=declaration.uses_z_s)
-    information_model = InformationModel(history.clone(), config.stage1.features) if declaration.uses_z_s else None
+    information_model = None
+    if declaration.uses_z_s and config.information.intrinsic_weight > 0:
+        information_model = InformationModel(history.clone(), config.stage1.features)
     dqn = config.dqn
     updates = max(1, round(config.steps * dqn.updates_per_step))
     rate = optax.linear_schedule(dqn.learning_rate, dqn.learning_rate * dqn.final_learning_rate, updates)
@@ -198,6 +215,6 @@ def _example_tokens(network: TwoBranchQ) -> Tokens:
     zeros = jnp.zeros((1, 1), jnp.int32)
     spec = network.observation_spec
     return Tokens(
-        frames=jnp.zeros((1, *spec.shape), spec.dtype), frame=None, previous_action=zeros,
-        reward=jnp.zeros((1, 1)), terminated=zeros > 0, truncated=zeros > 0, segment=zeros + 1, position=zeros, z_s=None,
+        frames=jnp.zeros((1, *spec.shape), spec.dtype), frame=None, z_s=None, previous_action=zeros,
+        reward=jnp.zeros((1, 1)), terminated=zeros > 0, truncated=zeros > 0, segment=zeros + 1, position=zeros,
     )

@@ -18,8 +18,10 @@ class Variant:
 
 
 VARIANTS = {
-    "mi": Variant("Ours", "bonus for information on z_s, prediction of z_s, psi in the memoryless branch (Section 3.2)", True),
-    "base": Variant("DTQN", "the plain two-branch memory agent (paper Appendix A.1)", False),
+    "mi": Variant(
+        "Ours", "bonus for information on z_s, prediction of z_s, psi in the memoryless branch (Section 3.2)",
+        uses_z_s=True),
+    "base": Variant("DTQN", "the plain two-branch memory agent (paper Appendix A.1)", uses_z_s=False),
 }
 
 

@@ -1,0 +1,167 @@
+"""The train command: options, both stages on a tiny run, kill and resume, bad input."""
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from mijax import train
+from mijax.config import Config, ConfigError, config_from_dict, parse_seeds
+from mijax.metrics import RunError, RunFolder
+
+pytestmark = pytest.mark.lenient
+
+TINY = """
+    --network.action-embedding 4 --network.observation-embedding 4 --network.critic-hidden 8
+    --network.auxiliary-hidden 8 --stage1.episodes 12 --stage1.heldout-episodes 8 --stage1.epochs 2
+    --stage1.batch-size 100 --dqn.batch-episodes 4 --dqn.replay-steps 2000 --dqn.warmup-episodes 4
+    --evaluation.every 200 --evaluation.episodes 4 --checkpoint.every 1
+""".split()
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "mijax.train", *arguments]
+
+
+def comparable(run: pathlib.Path, seed: int) -> list[dict]:
+    """A seed's metrics without the seconds."""
+    rows = RunFolder.open(run).metrics(seed)
+    return [{name: value for name, value in row.items() if not name.startswith("wall/")} for row in rows]
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """Both stages of `mi`, two seeds, never interrupted."""
+    path = tmp_path_factory.mktemp("runs") / "whole"
+    arguments = ["--domain", "heaven_hell", "--seeds", "0,3", "--steps", "1200", "--seeds.strategy", "map", *TINY]
+    assert train.main([*arguments, "--out", str(path)]) == 0
+    return path
+
+
+def test_a_run_leaves_what_it_promises(whole_run: pathlib.Path) -> None:
+    run = RunFolder.open(whole_run)
+    summary = json.loads((whole_run / "summary.json").read_text())
+    assert {p.name for p in whole_run.iterdir()} >= {"config.json", "versions.json", "summary.json", "curve.png"}
+    assert run.seeds() == (0, 3)
+    for seed in run.seeds():
+        result = summary["seeds"][str(seed)]
+        assert set(result["wall"]) >= {"compile", "environment", "update", "evaluation", "stage1"}
+        assert 0 <= result["success"] <= 1 and result["length"] <= 50
+        assert [row["step"] for row in run.metrics(seed)] == [400, 600, 800, 1000, 1200]
+        assert (run.seed_path(seed) / "representation" / "probe.json").exists()
+
+
+def test_seed_three_alone_is_seed_three_of_many(whole_run: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    alone = tmp_path / "alone"
+    arguments = ["--seeds", "3,", "--steps", "600", "--seeds.strategy", "map", *TINY, "--out", str(alone)]
+    # the learning rate's schedule runs over the run's steps, so the shorter run is told the longer one's
+    assert train.main([*arguments, "--dqn.final-learning-rate", "1"]) == 0
+    beside = tmp_path / "beside"
+    arguments = ["--seeds", "0,3", "--steps", "600", "--seeds.strategy", "map", *TINY, "--out", str(beside)]
+    assert train.main([*arguments, "--representation", str(whole_run), "--dqn.final-learning-rate", "1"]) == 0
+    assert comparable(alone, 3) == comparable(beside, 3)
+
+
+def test_killed_and_resumed_is_never_interrupted(whole_run: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "killed"
+    arguments = ["--seeds", "0,3", "--steps", "1200", "--seeds.strategy", "map", *TINY, "--out", str(path)]
+    process = subprocess.Popen(command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 240
+    rows = path / "seed_0" / "metrics.jsonl"
+    while time.monotonic() < deadline and process.poll() is None:
+        if rows.exists() and rows.read_text().count("\n") >= 3:
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (path / "summary.json").exists(), "the kill came too late to test anything"
+    assert train.main(["--resume", str(path)]) == 0
+    for seed in (0, 3):
+        assert comparable(path, seed) == comparable(whole_run, seed)
+
+
+def test_a_corrupt_checkpoint_falls_back_to_the_one_before(whole_run: pathlib.Path, tmp_path: pathlib.Path,
+                                                           capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "corrupt"
+    subprocess.run(["cp", "-r", str(whole_run), str(path)], check=True)
+    newest = path / "seed_0" / "checkpoints" / "1200"
+    for file in newest.rglob("*"):
+        if file.is_file() and file.stat().st_size > 200:
+            file.write_bytes(b"\0" * 10)
+    assert train.main(["--resume", str(path)]) == 0
+    assert "corrupt" in capsys.readouterr().out
+    assert comparable(path, 0) == comparable(whole_run, 0)
+
+
+def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "stopped"
+    arguments = ["--agent", "base", "--steps", "100000", *TINY, "--out", str(path)]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, text=True, env=environment)
+    rows = path / "seed_0" / "metrics.jsonl"
+    deadline = time.monotonic() + 240
+    while time.monotonic() < deadline and not rows.exists() and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == 0 and f"--resume {path}" in said
+    steps = [int(p.name) for p in (path / "seed_0" / "checkpoints").iterdir() if p.name.isdigit()]
+    assert max(steps) == RunFolder.open(path).metrics(0)[-1]["step"]
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("5", (0, 1, 2, 3, 4)), ("3,7", (3, 7)), ("3,", (3,))])
+def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["0", "", "-1", "a", "1,1", "2.5"])
+def test_bad_seeds(text: str) -> None:
+    with pytest.raises(ConfigError, match="--seeds"):
+        parse_seeds(text)
+
+
+def test_a_stored_configuration_comes_back() -> None:
+    import dataclasses
+
+    config = Config(domain="sphinx", steps=123_000)
+    assert config_from_dict(json.loads(json.dumps(dataclasses.asdict(config)))) == config
+    with pytest.raises(ConfigError, match="dqn.wrong"):
+        config_from_dict({"dqn": {"wrong": 1}})
+
+
+@pytest.mark.parametrize(("arguments", "named"), [
+    (["--domain", "nowhere"], "nowhere"),
+    (["--agent", "best"], "--agent"),
+    (["--dqn.batch-episodes", "7"], "--dqn.batch-episodes"),
+    (["--steps", "-5"], "--steps"),
+    (["--evaluation.every", "33"], "--evaluation.every"),
+    (["--resume", "/nonexistent"], "/nonexistent"),
+    (["--domain", "json:dumps"], "json"),
+])
+def test_bad_input_is_one_line_and_leaves_nothing(
+    arguments: list[str], named: str, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = [] if "--resume" in arguments else ["--out", str(tmp_path / "run")]
+    assert train.main([*arguments, *out]) != 0
+    error = capsys.readouterr().err.strip()
+    assert named in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_representation_of_another_domain_is_refused(whole_run: pathlib.Path, tmp_path: pathlib.Path,
+                                                       capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--domain", "sphinx", "--representation", str(whole_run), "--out", str(tmp_path / "run")]
+    assert train.main(arguments) == 1
+    assert "heaven_hell" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_divergence_is_named() -> None:
+    with pytest.raises(RunError, match="seed 3: loss/td is nan at step 400"):
+        train._refuse_divergence(3, {"step": 400, "loss/td": np.nan}, Config())

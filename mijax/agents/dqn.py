@@ -10,7 +10,7 @@ from flax import struct
 
 from envs_mjx.base import DiscreteActions, Environment
 from mijax.agents.variants import Variant, variant
-from mijax.config import Config, ConfigError
+from mijax.config import Config, ConfigError, require
 from mijax.losses import information as info
 from mijax.losses import td
 from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, TwoBranchQ
@@ -46,7 +46,8 @@ class DQN:
             agent["bottom"] = cast(Representation, representation).psi
         params: dict[str, Params] = {"agent": agent}
         if self.information_model is not None:
-            params["f"] = [self.information_model.init(key, tokens)["params"] for key in jax.random.split(key_f, self.config.information.folds)]
+            keys = jax.random.split(key_f, self.config.information.folds)
+            params["f"] = [self.information_model.init(key, tokens)["params"] for key in keys]
         target = jax.tree.map(jnp.copy, params["agent"])
         return AgentState(params, target, self.optimizer.init(params), jnp.zeros((), jnp.int32))
 
@@ -197,6 +198,10 @@ def make_agent(env: Environment, config: Config) -> DQN:
     if not isinstance(env.action_spec, DiscreteActions):
         raise ConfigError(f"--domain: {env.name} has continuous actions, accepted by this agent: discrete actions")
     declaration = variant(config.agent)
+    net = config.network
+    width = net.action_embedding + net.observation_embedding
+    require(config.memory != "gpt" or width % net.heads == 0, "network.heads", net.heads,
+            f"a divisor of the transformer's width {width} (action-embedding + observation-embedding)")
     history = HistoryEncoder(env.action_spec.num, env.horizon + 1, config.memory, config.network)
     network = TwoBranchQ(
         history, env.observation_spec, config.stage1.features, bottom_psi=declaration.uses_z_s,

@@ -10,5 +10,5 @@ CONFIG = Config(
     steps=500_000,
     stage1=Stage1Config(episodes=500, epochs=300, learning_rate=3e-3, lambda_r=10.0, lambda_s=0.5, lambda_o=0.03,
                         lambda_club=0.3, lambda_dim_s=0.0, lambda_dim_o=0.5),
-    network=NetworkConfig(action_embedding=16, observation_embedding=100),
+    network=NetworkConfig(action_embedding=16, observation_embedding=48),
 )

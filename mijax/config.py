@@ -71,24 +71,28 @@ class Stage1Config:
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:
-    """The networks of the agent (paper Appendix A.7)."""
+    """The networks of the agent (paper Appendix A.7).
+
+    The defaults are half as wide as the paper's: on Heaven-Hell they learn as well at a quarter of the cost.
+    """
 
     layers: int = 1
     """Transformer blocks."""
     heads: int = 2
     """Attention heads per block."""
-    gru_width: int = 128
-    """Hidden units of the GRU, when the memory is one."""
-    action_embedding: int = 64
-    """Width of the embedded previous action."""
-    observation_embedding: int = 64
-    """Width of the embedded observation."""
-    critic_hidden: tuple[int, ...] = (256, 256)
-    """Hidden layers of the Q head."""
-    auxiliary_hidden: tuple[int, ...] = (128, 128)
-    """Hidden layers of the heads that predict z_s."""
-    dropout: float = 0.0
-    """Dropout in the transformer's residual branches, in gradient passes only: never while acting or in targets."""
+    gru_width: int = 64
+    """Hidden units of the GRU, when the memory is one (paper: 128)."""
+    action_embedding: int = 32
+    """Width of the embedded previous action (paper: 64 for vectors, 16 for images)."""
+    observation_embedding: int = 32
+    """Width of the embedded observation (paper: 64 for vectors, 100 for images)."""
+    critic_hidden: tuple[int, ...] = (128, 128)
+    """Hidden layers of the Q head (paper: 256, 256)."""
+    auxiliary_hidden: tuple[int, ...] = (64, 64)
+    """Hidden layers of the heads that predict z_s (paper: 128, 128)."""
+    dropout: float = 0.1
+    """Dropout in the transformer's residual branches, in gradient passes only: never while acting, in targets or in the
+    bonus. Without it the agent learns the replay's episodes by heart, and its greedy policy comes and goes."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the arithmetic; parameters stay float32."""
 

@@ -1,0 +1,27 @@
+"""The paper's own stage-2 numbers (Table 2, Appendix A.6 and A.7) in place of ours: `--preset paper`."""
+
+import dataclasses
+
+from mijax.config import Config
+
+CRITIC_LEARNING_RATE = {"sphinx": 3e-5, "carflag_2d": 3e-5}
+"""Table 2: 3e-5 on Sphinx and CarFlag-2D, 3e-4 elsewhere."""
+INTRINSIC_WEIGHT = {"heaven_hell": 10.0, "sphinx": 10.0, "carflag_2d": 0.0}
+"""Table 2, for the bonus in its cosine form."""
+EPOCHS = 1000
+
+
+def paper(config: Config, vector_observation: bool) -> Config:
+    """A domain's preset with the paper's networks, losses and schedule; stage 1 keeps Table 3's weights, 1000 epochs."""
+    network = dataclasses.replace(
+        config.network, gru_width=128, critic_hidden=(256, 256), auxiliary_hidden=(128, 128), dropout=0.1,
+        action_embedding=64 if vector_observation else 16, observation_embedding=64 if vector_observation else 100)
+    dqn = dataclasses.replace(
+        config.dqn, learning_rate=CRITIC_LEARNING_RATE.get(config.domain, 3e-4), final_learning_rate=1.0, discount=0.99,
+        trace_decay=0.0, target_rate=0.005, batch_episodes=64, updates_per_step=0.25, warmup_episodes=10,
+        epsilon_steps=config.steps // 10 if config.steps >= 500_000 else 50_000)
+    information = dataclasses.replace(
+        config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(config.domain, 10.0),
+        intrinsic_form="cosine")
+    stage1 = dataclasses.replace(config.stage1, epochs=EPOCHS)
+    return dataclasses.replace(config, network=network, dqn=dqn, information=information, stage1=stage1)

@@ -211,7 +211,7 @@ class Config:
     domain: str = "heaven_hell"
     """A registered environment, or `package.module:EnvClass`."""
     agent: str = "mi"
-    """Which agent of `mijax.agents.variants`."""
+    """mi (ours) or base (DTQN): see mijax.agents.variants."""
     memory: MemoryName = "gpt"
     """The sequence model of the memory branch."""
     steps: int = 100_000

@@ -8,13 +8,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
 import tyro
 
 import configs
+from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.base import Environment
 from envs_mjx.grid.optimal import optimum
@@ -43,6 +44,8 @@ class TrainOptions:
     """Train an agent on a domain: stage 1 (representation), then stage 2 (task)."""
 
     config: Annotated[Config, tyro.conf.arg(name="")]
+    preset: Literal["default", "paper"] = "default"
+    """Whose numbers the other options start from: ours, or the paper's."""
     seeds: str = "1"
     """How many seeds (5: seeds 0 to 4), or which ones (3,7; a single one with a comma: 3,)."""
     out: pathlib.Path | None = None
@@ -59,12 +62,16 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
     """Options in two stages: the domain first, since its preset gives the defaults of all the others."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--domain", default="heaven_hell")
+    first.add_argument("--preset", default="default")
     first.add_argument("--resume", type=pathlib.Path)
     first.add_argument("--steps", type=int)
     known, others = first.parse_known_args(list(arguments))
     if known.resume is not None and not {"-h", "--help"} & set(others):
         return _resumed(known, others, arguments)
-    default = TrainOptions(config=configs.preset(known.domain))
+    config = configs.preset(known.domain)
+    if known.preset == "paper":
+        config = paper(config, vector_observation=not registry.make(known.domain).observation_spec.is_image)
+    default = TrainOptions(config=config)
     return tyro.cli(TrainOptions, default=default, args=list(arguments), prog="python -m mijax.train")
 
 

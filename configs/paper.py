@@ -12,7 +12,7 @@ EPOCHS = 1000
 
 
 def paper(config: Config, vector_observation: bool) -> Config:
-    """A domain's preset with the paper's networks, losses and schedule; stage 1 keeps Table 3's weights, 1000 epochs."""
+    """A domain's preset with the paper's networks, losses and schedule, and its 1000 epochs of stage 1."""
     network = dataclasses.replace(
         config.network, gru_width=128, critic_hidden=(256, 256), auxiliary_hidden=(128, 128), dropout=0.1,
         action_embedding=64 if vector_observation else 16, observation_embedding=64 if vector_observation else 100)

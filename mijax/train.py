@@ -105,10 +105,11 @@ class CompileClock:
         self._total, self._lock = 0.0, threading.Lock()
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
-    def _listen(self, event: str, seconds: float, **_: str | int) -> None:
+    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        del kwargs
         if event.endswith(("backend_compile_duration", "compilation_cache/cache_retrieval_time_sec")):
             with self._lock:
-                self._total += seconds
+                self._total += duration_secs
 
     def lap(self) -> float:
         """Seconds since the last call."""

@@ -1,0 +1,1 @@
+"""Commands around the library: the bench, sweeps and the paper's figures."""

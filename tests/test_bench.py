@@ -1,0 +1,44 @@
+"""The bench runs and reports every measurement; its timings are not tested. The count of arithmetic is."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from launch import bench
+from launch.arithmetic import operations
+
+
+def test_products_loops_and_dead_code_are_counted():
+    x, w = jnp.ones((3, 5)), jnp.ones((5, 7))
+    assert operations(lambda x, w: x @ w, x, w) == 2 * 3 * 5 * 7
+    assert operations(lambda x, w: (x @ w, x)[1], x, w) == 0
+    assert operations(jax.jit(jax.grad(lambda w: jnp.sum(jnp.square(x @ w)))), w) == 2 * (2 * 3 * 5 * 7)
+    square = jnp.ones((4, 4))
+    assert operations(lambda y: jax.lax.fori_loop(0, 6, lambda _, z: z @ square, y), square) == 6 * 2 * 4**3
+
+
+def test_a_convolution_is_counted():
+    image, kernel = jnp.ones((2, 6, 6, 3)), jnp.ones((2, 2, 3, 8))
+    convolve = lambda x, k: jax.lax.conv_general_dilated(  # noqa: E731
+        x, k, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+    assert operations(convolve, image, kernel) == 2 * (2 * 5 * 5 * 8) * 3 * 4
+
+
+@pytest.mark.lenient  # optax promotes int32 step counts
+@pytest.mark.parametrize("domain", ["heaven_hell"])
+def test_quick_bench_reports_every_part_as_json(domain, capsys):
+    assert bench.main(["--json", "--quick", "--domains", domain]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["matmul_gflops"] > 0
+    what = [result["what"] for result in report["results"]]
+    assert what == ["float32 matmul 64", "environment, batch 1", "environment, batch 8", "acting, batch 4", "stage 1",
+                    "stage 2, full length", "stage 2, trained agent's replay", "stage 2, paper's sizes, full length",
+                    "stage 2, paper's sizes, trained agent's replay"]
+    for result in report["results"][1:]:
+        assert result["domain"] == domain
+        assert result["per_second"] > 0
+    for result in report["results"][3:]:
+        assert result["gflop"] > 0
+        assert result["matmul_fraction"] > 0

@@ -73,7 +73,7 @@ def test_seed_three_alone_is_seed_three_of_many(whole_run: pathlib.Path, tmp_pat
 def test_killed_and_resumed_is_never_interrupted(whole_run: pathlib.Path, tmp_path: pathlib.Path) -> None:
     path = tmp_path / "killed"
     arguments = ["--seeds", "0,3", "--steps", "1200", "--seeds.strategy", "map", *TINY, "--out", str(path)]
-    process = subprocess.Popen(command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = subprocess.Popen(command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 240
     rows = path / "seed_0" / "metrics.jsonl"
     while time.monotonic() < deadline and process.poll() is None:

@@ -10,8 +10,11 @@ IntrinsicForm = Literal["explained_variance", "cosine"]
 SeedStrategy = Literal["auto", "map", "vmap", "shard"]
 
 
-class ConfigError(ValueError):
-    """An option has a value that cannot be run; the message names the option and what is accepted."""
+class ConfigError(Exception):
+    """An option has a value that cannot be run; the message names the option and what is accepted.
+
+    No ValueError: the command line parser would wrap those in a box of its own.
+    """
 
 
 def require(condition: bool, option: str, value: object, accepted: str) -> None:

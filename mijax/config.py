@@ -166,6 +166,7 @@ class InformationConfig:
 
     def __post_init__(self) -> None:
         _require_at_least("information.", self, 0, "auxiliary_weight", "intrinsic_weight")
+        require(self.folds in (1, 2), "information.folds", self.folds, "1 or 2")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,10 +17,10 @@ from mijax.types import Representation, Tokens
 
 ACTIONS, FEATURES, ROW, GAMMA = 3, 4, 6, 0.9
 TINY = NetworkConfig(action_embedding=4, observation_embedding=4, gru_width=8, critic_hidden=(16,),
-                     auxiliary_hidden=(16,))
+                     auxiliary_hidden=(16,), dropout=0.0)
 CONFIG = Config(
     memory="gru", stage1=Stage1Config(features=FEATURES), network=TINY, dqn=DQNConfig(discount=GAMMA, target_rate=0.1),
-    information=InformationConfig(intrinsic_weight=0.5, auxiliary_weight=0.25),
+    information=InformationConfig(intrinsic_weight=0.5, auxiliary_weight=0.25, folds=2),
 )
 BASE = dataclasses.replace(CONFIG, agent="base")
 

@@ -18,12 +18,14 @@ class MLP(nn.Module):
     hidden: Sequence[int]
     features: int
     dtype: jnp.dtype = jnp.float32
+    start_at_zero: bool = False  # the linear layer starts with zeros
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for width in self.hidden:
             x = nn.relu(nn.Dense(width, dtype=self.dtype)(x))
-        return nn.Dense(self.features, dtype=self.dtype)(x)
+        last = nn.initializers.zeros if self.start_at_zero else nn.initializers.lecun_normal()
+        return nn.Dense(self.features, kernel_init=last, dtype=self.dtype)(x)
 
 
 class ObservationEmbedder(nn.Module):

@@ -54,7 +54,7 @@ def test_a_run_leaves_what_it_promises(whole_run: pathlib.Path) -> None:
         result = summary["seeds"][str(seed)]
         assert set(result["wall"]) >= {"compile", "environment", "update", "evaluation", "stage1"}
         assert 0 <= result["success"] <= 1
-        assert result["length"] <= 50
+        assert result["length"] <= 50 * (1 + 1e-6)  # a float32 mean
         assert [row["step"] for row in run.metrics(seed)] == [400, 600, 800, 1000, 1200]
         assert (run.seed_path(seed) / "representation" / "probe.json").exists()
 

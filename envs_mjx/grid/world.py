@@ -4,6 +4,7 @@ Cells are numbered row by row from the top left; row 0 is the top and rows incre
 1 up, 2 left, 3 down; a move into a wall or off the grid stays put.
 """
 
+import abc
 import dataclasses
 
 import jax
@@ -76,13 +77,13 @@ class GridWorld(Environment):
         start_lists = np.argsort(~tables.starts.T, axis=1, kind="stable")
         self._starts = start_lists[:, : self._num_starts.max()].astype(np.int32)
 
+    @abc.abstractmethod
     def observe(self, cell: jax.Array, shown: jax.Array) -> jax.Array:
         """(*observation_shape) what is seen on `cell` when goal `shown` - 1 is visible; 0: none is. Both () int32."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def read(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The inverse of `observe`: cell and shown, both () int32."""
-        raise NotImplementedError
 
     def reset(self, key: jax.Array) -> tuple[GridState, TimeStep]:
         """Draw a goal uniformly, then a start uniformly among those the goal allows."""

@@ -121,10 +121,9 @@ class Environment(abc.ABC):
         del env_state
         return jnp.zeros((), bool)
 
-    def max_distinct_observations(self, num_episodes: int) -> int | None:
-        """At most how many different observations `num_episodes` whole episodes can hold; None when unbounded.
+    def all_observations(self) -> np.ndarray | None:
+        """(D, *observation_shape) every observation there can be, each once; None, the default, when too many to list.
 
-        Learners encode each distinct observation once when this is far below the number of steps.
+        Learners store and encode listed observations once, however often they are seen.
         """
-        del num_episodes
         return None

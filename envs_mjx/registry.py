@@ -81,6 +81,10 @@ def _import(name: str, path: str) -> Callable[[], object]:
     return factory
 
 
+def _one_line_of(array: np.ndarray) -> str:
+    return " ".join(np.array_str(array).split())[:100]
+
+
 def _one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
@@ -105,10 +109,10 @@ def check_contract(env: Environment, num_steps: int = 3) -> None:
     ):
         _check_array(env, place, _evaluate(env, place, function, env_state), expected)
     _check_array(env, "success", _evaluate(env, "success", env.success, later), ArraySpec((), bool))
-    distinct = env.max_distinct_observations(1)
-    _require(env, distinct is None or (type(distinct) is int and distinct > 0), "max_distinct_observations(1)",
-             distinct, "a positive int or None")
-    _check_rollout(env, num_steps)
+    listed = env.all_observations()
+    if listed is not None:
+        _check_list(env, listed)
+    _check_rollout(env, num_steps, listed)
 
 
 def sample_action(env: Environment, key: jax.Array) -> jax.Array:
@@ -174,26 +178,42 @@ def _check_same_structure(env: Environment, before: EnvState, after: EnvState) -
         _check_array(env, f"EnvState{jax.tree_util.keystr(path)} of step", other, ArraySpec(leaf.shape, leaf.dtype))
 
 
-def _check_rollout(env: Environment, num_steps: int) -> None:
+def _check_list(env: Environment, listed: object) -> None:
+    _require(env, isinstance(listed, np.ndarray) and len(listed) > 0, "all_observations", type(listed).__name__,
+             "an ndarray that is not empty, or None")
+    listed = np.asarray(listed)
+    _check_array(env, "an entry of all_observations", listed[0], env.observation_spec)
+    different = len(np.unique(listed.reshape(len(listed), -1), axis=0))
+    _require(env, different == len(listed), "the number of different observations in all_observations", different,
+             f"{len(listed)}, each once")
+
+
+def _check_rollout(env: Environment, num_steps: int, listed: np.ndarray | None) -> None:
     keys = jax.random.split(jax.random.key(1), num_steps + 1)
     env_state, timestep = jax.jit(env.reset)(keys[0])
     _require(env, float(timestep.reward) == 0, "reward of reset", float(timestep.reward), "0")
     _require(env, not bool(timestep.done), "terminated or truncated of reset", True, "False")
-    _check_values(env, "reset", env_state, timestep)
+    _check_values(env, "reset", env_state, timestep, listed)
     step = jax.jit(env.step)
     for key in keys[1:]:
         if timestep.done:
             break
         env_state, timestep = step(key, env_state, sample_action(env, key))
         _check_timestep(env, "step", timestep)
-        _check_values(env, "step", env_state, timestep)
+        _check_values(env, "step", env_state, timestep, listed)
 
 
-def _check_values(env: Environment, place: str, env_state: EnvState, timestep: TimeStep) -> None:
+def _check_values(
+    env: Environment, place: str, env_state: EnvState, timestep: TimeStep, listed: np.ndarray | None
+) -> None:
     for field in ("observation", "state", "reward"):
         value = np.asarray(getattr(timestep, field))
         if np.issubdtype(value.dtype, np.floating):
             _require(env, bool(np.isfinite(value).all()), f"{field} of {place}", "not finite", "finite numbers")
+    if listed is not None:
+        seen = np.asarray(timestep.observation)
+        found = (listed == seen).reshape(len(listed), -1).all(axis=1).any()
+        _require(env, bool(found), f"observation of {place}", _one_line_of(seen), "one listed by all_observations")
     truth = np.asarray(env.ground_truth(env_state))
     for variable, value in zip(env.variables, truth, strict=True):
         if variable.num_values is not None:

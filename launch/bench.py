@@ -32,10 +32,9 @@ from mijax.learner import Learner, make_learner
 from mijax.nets.encoders import encoder_for
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices
 from mijax.replay import Replay, StepRecord, sample_episodes
-from mijax.representation.dataset import collect, random_action, tabulate
-from mijax.representation.model import networks_for
+from mijax.representation.dataset import collect, random_action
 from mijax.representation.train import Problem, initial_state, make_epoch
-from mijax.rollout import record_of, select
+from mijax.rollout import select
 from mijax.types import Metrics, Representation
 
 
@@ -173,7 +172,7 @@ def bench_stage1(bench: Bench, env: Environment) -> Iterator[Result]:
     if bench.sizes.stage1_episodes:
         config = dataclasses.replace(config, episodes=bench.sizes.stage1_episodes, batch_size=100)
     data = collect(env, jax.random.key(0), config.episodes)
-    problem = Problem(networks_for(env, config.features), config, data, *tabulate(data))
+    problem = Problem.of(env, config, data)
     state, epoch, updates = initial_state(problem, jax.random.key(1)), make_epoch(problem), problem.updates_per_epoch
     gflop = 1e-9 * operations(epoch, state, jax.random.key(2)) / updates
     yield bench.measure(env.name, "stage 1", "updates", updates, 1, epoch, state, jax.random.key(2), gflop=gflop,
@@ -229,10 +228,7 @@ def optimal_replay(
     best = plan(env, learner.config.dqn.discount)
     if best is None or not isinstance(env, GridWorld):
         return None
-    policy, phi = OptimalPolicy(env, best), encoder_for(env.state_spec, learner.config.stage1.features)
-
-    def label(states: jax.Array) -> jax.Array:
-        return jnp.asarray(phi.apply({"params": representation.phi}, states))
+    policy = OptimalPolicy(env, best)
 
     def play(key: jax.Array) -> tuple[StepRecord, jax.Array]:
         key_reset, key_steps = jax.random.split(key)
@@ -248,7 +244,7 @@ def optimal_replay(
         _, (later, action, over) = jax.lax.scan(step, start, jax.random.split(key_steps, env.horizon))
         timesteps = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), timestep, later)
         previous = jnp.concatenate([jnp.full((1,), -1, jnp.int32), action])
-        return record_of(timesteps, previous, label), 1 + jnp.sum(~over, dtype=jnp.int32)
+        return learner.recorder(representation)(timesteps, previous), 1 + jnp.sum(~over, dtype=jnp.int32)
 
     data, length = jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(2), episodes))
     slots = jnp.arange(episodes, dtype=jnp.int32)
@@ -271,10 +267,8 @@ def update_gflop(
     learner: Learner, agent: AgentState, representation: Representation, replay: Replay, rows: int
 ) -> float:
     """Arithmetic of one stage-2 update on `rows` rows of tokens."""
-    max_frames = learner.env.max_distinct_observations(learner.config.dqn.batch_episodes)
-
     def update(agent: AgentState, key: jax.Array) -> AgentState:
-        tokens = gather_rows(replay, jnp.arange(rows) % replay.capacity, one_per_row(rows), rows, max_frames)
+        tokens = gather_rows(replay, jnp.arange(rows) % replay.capacity, one_per_row(rows), rows, learner.observations)
         return learner.agent.update(agent, tokens, representation, key)[0]
 
     return 1e-9 * operations(update, agent, jax.random.key(0))

@@ -12,14 +12,16 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.typing import DTypeLike
 
-from envs_mjx.base import Environment
+from envs_mjx.base import DiscreteActions, Environment, TimeStep
 from mijax.agents.dqn import DQN, AgentState, make_agent
 from mijax.config import Config
 from mijax.nets.encoders import encoder_for
+from mijax.nets.frames import FrameTable
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices, stack_folds
-from mijax.replay import Replay, init_replay, sample_episodes, write
-from mijax.rollout import Episodes, EpisodeTotals, Labeller, collect_step, evaluate, record_of, start_episodes
+from mijax.replay import Replay, StepRecord, init_replay, sample_episodes, write
+from mijax.rollout import Episodes, EpisodeTotals, Recorder, collect_step, evaluate, start_episodes
 from mijax.types import Metrics, Representation
 
 
@@ -42,6 +44,7 @@ class Learner:
     env: Environment
     config: Config
     agent: DQN
+    observations: FrameTable | None  # all that the environment can show; the replay then stores which, not what
     pack: bool = True  # choose the number of packed rows at run time; a branch that `vmap` would turn into all of them
 
     def init(self, key: jax.Array, representation: Representation | None) -> LearnerState:
@@ -49,7 +52,7 @@ class Learner:
         key_agent, key_start, key_warmup, key_run = jax.random.split(key, 4)
         num_envs = self.config.num_envs
         episodes = start_episodes(self.env, self.agent, num_envs, key_start)
-        first = record_of(episodes.timestep, episodes.previous_action, self._labeller(representation))
+        first = self.recorder(representation)(episodes.timestep, episodes.previous_action)
         capacity = max(num_envs, self.config.dqn.replay_steps // self.env.horizon)
         replay = init_replay(first, capacity, self.env.horizon)
         state = LearnerState(
@@ -108,21 +111,37 @@ class Learner:
         """Greedy episodes of the averaged network: per-episode results, each (num_episodes,)."""
         return evaluate(self.env, self.agent, state.agent.target, num_episodes, key)
 
-    def _labeller(self, representation: Representation | None) -> Labeller:
-        if representation is None:
-            return None
+    def recorder(self, representation: Representation | None) -> Recorder:
+        """What the replay stores, z_s among it when there is a representation."""
         phi = encoder_for(self.env.state_spec, self.config.stage1.features)
-        return lambda states: cast(jax.Array, phi.apply({"params": representation.phi}, states))
+        num_actions = cast(DiscreteActions, self.env.action_spec).num
+        table = self.observations
+
+        def record(timestep: TimeStep, previous_action: jax.Array) -> StepRecord:
+            z_s = None
+            if representation is not None:
+                z_s = cast(jax.Array, phi.apply({"params": representation.phi}, timestep.state))
+            index = None if table is None else table.index_of(timestep.observation).astype(_integer_for(len(table)))
+            return StepRecord(
+                observation=timestep.observation if index is None else index,
+                previous_action=previous_action.astype(_integer_for(num_actions)),
+                reward=timestep.reward,
+                terminated=timestep.terminated,
+                truncated=timestep.truncated,
+                z_s=z_s,
+            )
+
+        return record
 
     def _collect(
         self, state: LearnerState, epsilon: jax.Array, steps: int, key: jax.Array
     ) -> tuple[LearnerState, EpisodeTotals]:
-        label = self._labeller(state.representation)
+        record = self.recorder(state.representation)
         params = state.agent.params["agent"]
 
         def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
             episodes, replay, totals = carry
-            return collect_step(self.env, self.agent, params, label, epsilon, episodes, replay, totals, key), None
+            return collect_step(self.env, self.agent, params, record, epsilon, episodes, replay, totals, key), None
 
         carry = (state.episodes, state.replay, EpisodeTotals.zero())
         (episodes, replay, totals), _ = jax.lax.scan(step, carry, jax.random.split(key, steps))
@@ -140,17 +159,16 @@ class Learner:
     ) -> tuple[AgentState, Metrics]:
         """One gradient update on a batch of episodes, packed into as few rows as they need."""
         batch = self.config.dqn.batch_episodes
-        max_frames = self.env.max_distinct_observations(batch)
         key_sample, key_loss = jax.random.split(key)
         slots = sample_episodes(replay, key_sample, batch)
         if not self.pack:
-            tokens = gather_rows(replay, slots, one_per_row(batch), batch, max_frames)
+            tokens = gather_rows(replay, slots, one_per_row(batch), batch, self.observations)
             return self.agent.update(agent, tokens, representation, key_loss)
         layout = fit_folds(replay.length[slots], replay.data.reward.shape[1])
         choices = row_choices(batch // 2)
 
         def with_rows(rows: int) -> tuple[AgentState, Metrics]:
-            tokens = gather_rows(replay, slots, stack_folds(layout, rows), 2 * rows, max_frames)
+            tokens = gather_rows(replay, slots, stack_folds(layout, rows), 2 * rows, self.observations)
             return self.agent.update(agent, tokens, representation, key_loss)
 
         branch = jnp.searchsorted(jnp.asarray(choices), layout.num_rows)
@@ -159,4 +177,10 @@ class Learner:
 
 def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:
     """The learner that a configuration describes."""
-    return Learner(env, config, make_agent(env, config), pack)
+    listed = env.all_observations()
+    return Learner(env, config, make_agent(env, config), None if listed is None else FrameTable(listed), pack)
+
+
+def _integer_for(count: int) -> DTypeLike:
+    """The smallest type that holds -1 and 0 .. count - 1."""
+    return next(kind for kind in (jnp.int8, jnp.int16, jnp.int32) if count - 1 <= jnp.iinfo(kind).max)

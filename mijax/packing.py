@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from mijax.nets.frames import FrameTable
 from mijax.replay import Replay
 from mijax.types import Tokens
 
@@ -60,12 +61,10 @@ def row_choices(episodes: int) -> tuple[int, ...]:
     return tuple(sorted({-(-episodes * eighths // 8) for eighths in (3, 5, 8)}))
 
 
-def gather_rows(replay: Replay, slots: jax.Array, layout: Layout, rows: int, max_frames: int | None) -> Tokens:
-    """Read (B,) episodes from the replay into `rows` packed rows.
-
-    With `max_frames`, an upper bound of the distinct observations among them, each distinct one appears once in
-    `frames`.
-    """
+def gather_rows(
+    replay: Replay, slots: jax.Array, layout: Layout, rows: int, observations: FrameTable | None
+) -> Tokens:
+    """Read (B,) episodes from the replay into `rows` packed rows; `observations` as for `Learner`."""
     row_length = replay.data.reward.shape[1]
     step = jnp.arange(row_length)[None]
     length = replay.length[slots]
@@ -80,13 +79,9 @@ def gather_rows(replay: Replay, slots: jax.Array, layout: Layout, rows: int, max
     def shaped(x: jax.Array) -> jax.Array:
         return x.reshape(rows, row_length, *x.shape[1:])
 
-    frames, frame = data.observation, None
-    if max_frames is not None and max_frames < frames.shape[0]:
-        frames, frame = distinct(frames, max_frames)
-        frame = shaped(frame)
     return Tokens(
-        frames=frames,
-        frame=frame,
+        frames=data.observation if observations is None else observations,
+        frame=None if observations is None else shaped(data.observation.astype(jnp.int32)),
         previous_action=shaped(jnp.where(used, data.previous_action.astype(jnp.int32), -1)),
         reward=shaped(data.reward),
         terminated=shaped(data.terminated),
@@ -95,34 +90,3 @@ def gather_rows(replay: Replay, slots: jax.Array, layout: Layout, rows: int, max
         position=shaped(jnp.where(used, position, 0)),
         z_s=None if data.z_s is None else shaped(data.z_s.astype(jnp.float32)),
     )
-
-
-def distinct(frames: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
-    """(N, *shape) frames -> (capacity, *shape) the distinct ones, and (N,) int32 which of them each is.
-
-    Frames are told apart by 64 bits of a random linear hash. `capacity` must bound the number of distinct frames.
-    """
-    num = frames.shape[0]
-    flat = _as_bits(frames.reshape(num, -1))
-    multipliers = jax.random.bits(jax.random.key(0), (2, flat.shape[1]), jnp.uint32) | 1
-    high, low = (jnp.sum(flat * m, axis=1, dtype=jnp.uint32) for m in multipliers[:, None])
-    high, low, order = jax.lax.sort((high, low, jnp.arange(num, dtype=jnp.int32)), num_keys=2)
-    changed = jnp.concatenate([jnp.zeros((1,), bool), (high[1:] != high[:-1]) | (low[1:] != low[:-1])])
-    rank = jnp.cumsum(changed, dtype=jnp.int32)
-    index = jnp.zeros((num,), jnp.int32).at[order].set(rank)
-    first = jnp.zeros((capacity,), jnp.int32).at[rank].set(order, mode="drop")
-    return frames[first], index
-
-
-def _as_bits(x: jax.Array) -> jax.Array:
-    """uint32 that differ where the numbers of `x` do; 0.0 and -0.0 are one number.
-
-    Short floats such as 1.0 and -0.5 differ in their highest bits alone, of which a linear hash keeps few: they are
-    mixed downwards first.
-    """
-    if x.dtype.itemsize == 1:
-        return x.astype(jnp.uint32)
-    x = jnp.where(x == 0, jnp.zeros((), x.dtype), x)
-    bits = jax.lax.bitcast_convert_type(x, jnp.dtype(f"uint{8 * x.dtype.itemsize}")).astype(jnp.uint32)
-    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
-    return bits ^ (bits >> 13)

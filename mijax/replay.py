@@ -16,8 +16,8 @@ from flax import struct
 class StepRecord:
     """What is stored of one step, for a token (a_{t-1}, o_t) and the transition that led to it."""
 
-    observation: jax.Array  # (E, *observation_shape) in the environment's own dtype
-    previous_action: jax.Array  # (E,) int32; -1 on the first step of an episode
+    observation: jax.Array  # (E, *observation_shape) in the environment's own dtype; or (E,) which of all there are
+    previous_action: jax.Array  # (E,) integer; -1 on the first step of an episode
     reward: jax.Array  # (E,) float32, received on arriving
     terminated: jax.Array  # (E,) bool, on arriving
     truncated: jax.Array  # (E,) bool, on arriving

@@ -13,8 +13,8 @@ from mijax.nets.two_branch import MemoryState
 from mijax.replay import Replay, StepRecord, finish, write
 from mijax.types import Metrics, Params
 
-Labeller = Callable[[jax.Array], jax.Array] | None
-"""phi: (E, *state_shape) -> (E, F), or None when z_s is not used."""
+Recorder = Callable[[TimeStep, jax.Array], StepRecord]
+"""What the replay stores of a step of E environments, from their time steps and (E,) previous actions."""
 
 
 @struct.dataclass
@@ -74,23 +74,11 @@ def start_episodes(env: Environment, agent: DQN, num_envs: int, key: jax.Array) 
     )
 
 
-def record_of(timestep: TimeStep, previous_action: jax.Array, label: Labeller) -> StepRecord:
-    """What the replay stores of one step of every environment."""
-    return StepRecord(
-        observation=timestep.observation,
-        previous_action=previous_action.astype(jnp.int8),
-        reward=timestep.reward,
-        terminated=timestep.terminated,
-        truncated=timestep.truncated,
-        z_s=None if label is None else label(timestep.state),
-    )
-
-
 def collect_step(
     env: Environment,
     agent: DQN,
     params: Params,
-    label: Labeller,
+    record: Recorder,
     epsilon: jax.Array,
     episodes: Episodes,
     replay: Replay,
@@ -105,7 +93,7 @@ def collect_step(
     )
     env_state, timestep = jax.vmap(env.step)(jax.random.split(key_env, num_envs), episodes.env_state, action)
     position, returns = episodes.position + 1, episodes.returns + timestep.reward
-    replay = write(replay, record_of(timestep, action, label), position)
+    replay = write(replay, record(timestep, action), position)
     done = timestep.done
     totals = EpisodeTotals(
         totals.episodes + jnp.sum(done, dtype=jnp.int32),
@@ -116,7 +104,7 @@ def collect_step(
     replay = finish(replay, done, position + 1)
     running = Episodes(env_state, timestep, memory, action, position, returns)
     episodes = select(done, start_episodes(env, agent, num_envs, key_reset), running)
-    first = record_of(episodes.timestep, episodes.previous_action, label)
+    first = record(episodes.timestep, episodes.previous_action)
     return episodes, write(replay, first, episodes.position, keep=done), totals
 
 

@@ -4,11 +4,13 @@ Letters: E environments, R packed rows, L tokens per row, N frames, A actions, F
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from mijax.nets.frames import FrameTable
 
 Params = Any
 """A pytree of float32 parameters (Flax linen)."""
@@ -37,8 +39,8 @@ class Tokens:
     Token t of an episode is what was known on arriving at step t: (a_{t-1}, o_t). Padding belongs to segment 0.
     """
 
-    frames: jax.Array  # (N, *observation_shape)  the observations to encode: one a token, or the distinct ones
-    frame: jax.Array | None  # (R, L) int32, which frame a token shows; None when frames are the tokens in order
+    frames: jax.Array | FrameTable  # (R L, *observation_shape)  the observations, or all that there are
+    frame: jax.Array | None  # (R, L) int32, which of all observations a token shows; None when frames are the tokens'
     previous_action: jax.Array  # (R, L) int32; -1 on the first token of an episode
     reward: jax.Array  # (R, L) float32, received on arriving
     terminated: jax.Array  # (R, L) bool, on arriving
@@ -53,10 +55,10 @@ class Tokens:
         halves = []
         for part in (slice(None, rows // 2), slice(rows // 2, None)):
             half = jax.tree.map(lambda x, part=part: x[part], dataclasses.replace(self, frames=None, frame=None))
-            if self.frame is None:
+            if isinstance(self.frames, jax.Array):
                 own = self.frames.reshape(rows, length, *self.frames.shape[1:])[part]
                 half = dataclasses.replace(half, frames=own.reshape(-1, *self.frames.shape[1:]))
             else:
-                half = dataclasses.replace(half, frames=self.frames, frame=self.frame[part])
+                half = dataclasses.replace(half, frames=self.frames, frame=cast(jax.Array, self.frame)[part])
             halves.append(half)
         return halves[0], halves[1]

@@ -100,12 +100,12 @@ def test_success_ends_an_episode(episodes: Episodes) -> None:
     assert not (success & ~episodes.timesteps.done)[episodes.valid].any()
 
 
-def test_distinct_observations_within_the_bound(episodes: Episodes) -> None:
-    observations = episodes.timesteps.observation.reshape(NUM_EPISODES, episodes.env.horizon + 1, -1)
-    for num in (1, 8, NUM_EPISODES):
-        bound = episodes.env.max_distinct_observations(num)
-        if bound is not None:
-            assert len(np.unique(observations[:num][episodes.valid[:num]], axis=0)) <= bound
+def test_every_observation_is_listed(episodes: Episodes) -> None:
+    listed = episodes.env.all_observations()
+    if listed is None:
+        pytest.skip("the environment lists none")
+    seen = np.asarray(episodes.timesteps.observation)[episodes.valid].reshape(-1, listed[0].size)
+    assert {row.tobytes() for row in seen} <= {row.tobytes() for row in listed.reshape(len(listed), -1)}
 
 
 def test_hidden_variable_is_invisible_off_the_information_cells(episodes: Episodes) -> None:
@@ -208,7 +208,10 @@ def _with(**attributes):
     (_with(variables=()), r"ground_truth is 'float32\[3\]', expected float32\[0\]"),
     (_with(ground_truth=lambda self, env_state: jnp.array([2.0, 0.0, 0.0])),
      r"'side' after reset is 2.0, expected a class in 0 \.\. 1"),
-    (_with(max_distinct_observations=lambda self, num: 0), r"max_distinct_observations\(1\) is 0"),
+    (_with(all_observations=lambda self: []), "all_observations is 'list', expected an ndarray"),
+    (_with(all_observations=lambda self: np.zeros((4, 2), np.float32)), r"all_observations is 'float32\[2\]'"),
+    (_with(all_observations=lambda self: np.zeros((4, 3), np.float32)), "different observations .* is 1, expected 4"),
+    (_with(all_observations=lambda self: np.zeros((1, 3), np.float32)), "expected one listed by all_observations"),
     (_with(reset=lambda self, key: None), "what reset returns is 'NoneType'"),
     (_with(step=lambda self, key, env_state, action: (env_state.cell, self.reset(key)[1])), "the EnvState of step"),
     (_with(step=lambda self, key, env_state, action: (

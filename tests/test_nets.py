@@ -12,6 +12,7 @@ import pytest
 from envs_mjx.base import ArraySpec, DiscreteActions, Environment
 from mijax.agents.dqn import DQN, make_agent
 from mijax.config import Config, MemoryName, NetworkConfig, Stage1Config
+from mijax.nets.frames import FrameTable
 from mijax.nets.gpt import sine_positions
 from mijax.packing import Layout, first_fit, gather_rows, one_per_row
 from mijax.replay import Replay, StepRecord
@@ -65,14 +66,21 @@ def stored_episodes(spec: ArraySpec = VECTOR) -> Replay:
     return Replay(data, jnp.array(LENGTHS, jnp.int32), slots, slots[:0], jnp.int32(len(LENGTHS)))
 
 
-def tokens_in(layout: Layout, rows: int, spec: ArraySpec = VECTOR, max_frames: int | None = None) -> Tokens:
-    return gather_rows(stored_episodes(spec), jnp.arange(len(LENGTHS), dtype=jnp.int32), layout, rows, max_frames)
+def tokens_in(layout: Layout, rows: int, spec: ArraySpec = VECTOR) -> Tokens:
+    return gather_rows(stored_episodes(spec), jnp.arange(len(LENGTHS), dtype=jnp.int32), layout, rows, None)
 
 
-def packed(spec: ArraySpec = VECTOR, max_frames: int | None = None) -> tuple[Layout, Tokens]:
+def listed(tokens: Tokens) -> Tokens:
+    """The same observations as entries of a list of all there are."""
+    frames, index = np.unique(np.asarray(tokens.frames), axis=0, return_inverse=True)
+    frame = jnp.asarray(index.reshape(tokens.segment.shape), jnp.int32)
+    return dataclasses.replace(tokens, frames=FrameTable(frames), frame=frame)
+
+
+def packed(spec: ArraySpec = VECTOR) -> tuple[Layout, Tokens]:
     layout = first_fit(jnp.array(LENGTHS, jnp.int32), ROW)
     assert int(layout.num_rows) == 3  # 8 | 5 + 3 | 2 and padding
-    return layout, tokens_in(layout, 3, spec, max_frames)
+    return layout, tokens_in(layout, 3, spec)
 
 
 def of_episodes(x: jax.Array, layout: Layout) -> np.ndarray:
@@ -128,7 +136,7 @@ def test_step_by_step_equals_the_full_pass(case: Case):
     step = jax.jit(lambda state, observation, action: case.module.apply(
         {"params": case.params}, state, observation, action, method="step"))
     state = case.agent.initial_memory(len(LENGTHS))
-    observation = case.tokens.frames.reshape(len(LENGTHS), ROW, *VECTOR.shape)
+    observation = jnp.asarray(case.tokens.frames).reshape(len(LENGTHS), ROW, *VECTOR.shape)
     values = []
     for t in range(ROW):
         state, q = step(state, observation[:, t], case.tokens.previous_action[:, t])
@@ -143,17 +151,16 @@ def test_packing_changes_nothing(case: Case):
     case.check_same(tokens, layout)
 
 
-def test_encoding_distinct_frames_once_changes_nothing(case: Case):
-    layout, tokens = packed(max_frames=sum(LENGTHS))
-    assert tokens.frames.shape[0] == sum(LENGTHS)
-    case.check_same(tokens, layout)
+def test_encoding_listed_observations_once_changes_nothing(case: Case):
+    layout, tokens = packed()
+    case.check_same(listed(tokens), layout)
 
 
 def change(tokens: Tokens, where: np.ndarray) -> Tokens:
     """Other observations, actions and features at the tokens (R, L) `where`; every frame is one token's."""
     mask = jnp.asarray(where)
     return tokens.replace(  # pyright: ignore[reportAttributeAccessIssue]
-        frames=jnp.where(mask.reshape(-1, 1), 9.0, tokens.frames),
+        frames=jnp.where(mask.reshape(-1, 1), 9.0, jnp.asarray(tokens.frames)),
         previous_action=jnp.where(mask, 2 - jnp.maximum(tokens.previous_action, 0), tokens.previous_action),
         z_s=None if tokens.z_s is None else jnp.where(mask[..., None], 7.0, tokens.z_s),
     )
@@ -220,7 +227,7 @@ def test_images_in_half_precision(memory: MemoryName):
     q, exact_q = of_episodes(q, layout), of_episodes(exact_q, layout)
     assert 0 < np.abs(q - exact_q).max() < 0.1 * np.abs(exact_q).max()
     state = half.initial_memory(2)
-    state, action = jax.jit(half.act)(params, state, tokens.frames[:2], jnp.array([-1, 0]))
+    state, action = jax.jit(half.act)(params, state, jnp.asarray(tokens.frames)[:2], jnp.array([-1, 0]))
     assert action.shape == (2,)
     assert {x.dtype for x in jax.tree.leaves(state.recurrent)} == {jnp.dtype(jnp.bfloat16)}
 

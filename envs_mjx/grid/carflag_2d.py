@@ -39,8 +39,3 @@ class CarFlag2D(ImageGridWorld):
         """(4,) float32: the goal's row and column, the agent's row and column."""
         goal_cell = jnp.asarray(self.tables.goals)[env_state.goal]
         return jnp.stack([*self._row_column(goal_cell), *self._row_column(env_state.cell)])
-
-    def max_distinct_observations(self, num_episodes: int) -> int:
-        """112 cells that show no goal; the 9 of the area, each with the goals of the episodes, 112 at most."""
-        num_goals = len(self.tables.goals)
-        return num_goals + int(self.tables.informs.sum()) * min(num_episodes, num_goals)

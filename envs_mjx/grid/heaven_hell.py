@@ -61,8 +61,3 @@ class HeavenHell(GridWorld):
         """(3,) float32: side (0 left, 1 right), column, row."""
         row, column = self._row_column(env_state.cell)
         return jnp.stack([env_state.goal.astype(jnp.float32), column, row])
-
-    def max_distinct_observations(self, num_episodes: int) -> int:
-        """13 cells that show no side, and the priest's cell with either."""
-        del num_episodes
-        return int((~self.tables.walls).sum()) + 1

@@ -42,8 +42,3 @@ class Sphinx(ImageGridWorld):
     def ground_truth(self, env_state: GridState) -> jax.Array:
         """(3,) float32: goal (0 top right, 1 bottom left, 2 bottom right), the agent's row and column."""
         return jnp.stack([env_state.goal.astype(jnp.float32), *self._row_column(env_state.cell)])
-
-    def max_distinct_observations(self, num_episodes: int) -> int:
-        """35 cells that show no goal, and the top-left cell with each of the three."""
-        del num_episodes
-        return self.tables.walls.size + 2

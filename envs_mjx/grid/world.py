@@ -108,6 +108,15 @@ class GridWorld(Environment):
         """() bool: whether the agent stands on an information cell."""
         return jnp.asarray(self.tables.informs)[env_state.cell]
 
+    def all_observations(self) -> np.ndarray:
+        """Every cell but the walls with no goal shown, and every information cell with each goal."""
+        tables = self.tables
+        open_cells = np.flatnonzero(~tables.walls.reshape(-1))
+        goals = np.arange(1, len(tables.goals) + 1)
+        pairs = [(cell, shown) for cell in open_cells for shown in (goals if tables.informs[cell] else (0,))]
+        cells, shown = np.array(pairs, np.int32).T
+        return np.asarray(jax.jit(jax.vmap(self.observe))(cells, shown))
+
     def _show(self, env_state: GridState, reward: jax.Array, terminated: jax.Array) -> TimeStep:
         goal_shown = env_state.goal + 1
         return TimeStep(

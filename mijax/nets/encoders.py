@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from envs_mjx.base import ArraySpec
+from mijax.nets.frames import Frames, Layers, apply_layer
 
 VECTOR_HIDDEN = (128, 128)
 SMALL_IMAGE_CHANNELS = (64, 128, 256)
@@ -28,6 +29,11 @@ class ConvBlock:
     kernel: int
     stride: int = 1
     pool: int = 1
+
+    @property
+    def layers(self) -> Layers:
+        """Kernel and stride of the convolution and of the pooling."""
+        return ((self.kernel, self.stride), *(((self.pool, self.pool),) if self.pool > 1 else ()))
 
     def output_size(self, size: int) -> int:
         """Rows after the block, from `size` rows before it."""
@@ -51,6 +57,7 @@ class Convolution(nn.Module):
         weights = self.param(
             "kernel", nn.initializers.lecun_normal(), (self.kernel, self.kernel, x.shape[-1], self.channels))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.channels,))
+        weights, bias = weights.astype(x.dtype), bias.astype(x.dtype)
         blocks = _gather_blocks(x, stride)
         rows, columns = blocks.shape[-3] - side + 1, blocks.shape[-2] - side + 1
         shifts = [blocks[..., i : i + rows, j : j + columns, :] for i in range(side) for j in range(side)]
@@ -82,13 +89,15 @@ class VectorEncoder(nn.Module):
 
     hidden: tuple[int, ...]
     features: int
+    layers = ()  # none that sees a window
 
     def setup(self) -> None:
         self.blocks = [nn.Dense(width) for width in self.hidden]
         self.output = nn.Dense(self.features)
 
-    def first_block(self, x: jax.Array) -> jax.Array:
+    def first_block(self, x: Frames) -> jax.Array:
         """(..., D) -> (..., hidden[0]): what the DIM discriminator shares (Fig. 28)."""
+        assert isinstance(x, jax.Array)
         return nn.relu(self.blocks[0](x.astype(jnp.float32)))
 
     def finish(self, h: jax.Array) -> jax.Array:
@@ -97,7 +106,7 @@ class VectorEncoder(nn.Module):
             h = nn.relu(block(h))
         return self.output(h)
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Frames) -> jax.Array:
         return self.finish(self.first_block(x))
 
 
@@ -108,27 +117,31 @@ class ImageEncoder(nn.Module):
     features: int
 
     def setup(self) -> None:
-        self.blocks = [
-            Convolution(b.channels, b.kernel, b.stride) for b in self.plan
-        ]
+        self.blocks = [Convolution(b.channels, b.kernel, b.stride) for b in self.plan]
         self.output = nn.Dense(self.features)
 
-    def _block(self, index: int, x: jax.Array) -> jax.Array:
+    @property
+    def layers(self) -> Layers:
+        """What can work on patches: nothing for large images, whose patches hardly repeat."""
+        return sum((block.layers for block in self.plan), ()) if self.plan[0].stride == 1 else ()
+
+    def _block(self, index: int, x: Frames) -> Frames:
         pool = self.plan[index].pool
-        x = nn.relu(self.blocks[index](x))
-        return _max_pool(x, pool) if pool > 1 else x
+        x = apply_layer(lambda y: nn.relu(self.blocks[index](y.astype(jnp.float32))), x)
+        return apply_layer(lambda y: _max_pool(y, pool), x) if pool > 1 else x
 
-    def first_block(self, x: jax.Array) -> jax.Array:
+    def first_block(self, x: Frames) -> Frames:
         """(..., rows, columns, channels) -> (..., rows', columns', channels'): what the discriminator shares."""
-        return self._block(0, x.astype(jnp.float32))
+        return self._block(0, x)
 
-    def finish(self, h: jax.Array) -> jax.Array:
+    def finish(self, h: Frames) -> jax.Array:
         """(..., rows', columns', channels') -> (..., features): all that follows the first block."""
         for index in range(1, len(self.plan)):
             h = self._block(index, h)
+        assert isinstance(h, jax.Array)
         return self.output(h.reshape(*h.shape[:-3], -1))
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Frames) -> jax.Array:
         return self.finish(self.first_block(x))
 
 

@@ -6,10 +6,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-
-def as_float(observation: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """Stored observations (uint8 planes, float vectors) as numbers to compute with."""
-    return observation.astype(dtype)
+from mijax.nets.encoders import Convolution
+from mijax.nets.frames import Frames, Patches, apply_layer
 
 
 class MLP(nn.Module):
@@ -29,18 +27,21 @@ class MLP(nn.Module):
 
 
 class ObservationEmbedder(nn.Module):
-    """(N, *observation_shape) -> (N, features): Linear + ReLU, after two small convolutions for images."""
+    """N observations -> (N, features): Linear + ReLU, after two small convolutions for images."""
 
     features: int
     dtype: jnp.dtype = jnp.float32
+    layers = ((2, 1), (2, 1))  # of images; not used on vectors
 
     @nn.compact
-    def __call__(self, observation: jax.Array) -> jax.Array:
-        x = as_float(observation, self.dtype)
-        if x.ndim == 4:
-            for channels in (8, 16):
-                x = nn.relu(nn.Conv(channels, (2, 2), padding="VALID", dtype=self.dtype)(x))
-        return nn.relu(nn.Dense(self.features, dtype=self.dtype)(x.reshape(x.shape[0], -1)))
+    def __call__(self, observation: Frames) -> jax.Array:
+        x = observation
+        if isinstance(x, Patches) or x.ndim == 4:
+            for channels, (kernel, stride) in zip((8, 16), self.layers, strict=True):
+                convolution = Convolution(channels, kernel, stride)
+                x = apply_layer(lambda y, conv=convolution: nn.relu(conv(y.astype(self.dtype))), x)
+        assert isinstance(x, jax.Array)
+        return nn.relu(nn.Dense(self.features, dtype=self.dtype)(x.reshape(x.shape[0], -1).astype(self.dtype)))
 
 
 class ActionEmbedder(nn.Module):

@@ -1,6 +1,6 @@
 """The two-branch agent and the information model f (paper Fig. 1)."""
 
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -9,11 +9,15 @@ from flax import struct
 
 from envs_mjx.base import ArraySpec
 from mijax.config import MemoryName, NetworkConfig
-from mijax.nets.encoders import encoder_for
+from mijax.nets.encoders import Encoder, encoder_for
+from mijax.nets.frames import FrameTable, keep_present, take
 from mijax.nets.gpt import GPT
 from mijax.nets.gru import GRU
 from mijax.nets.heads import MLP, ActionEmbedder, ObservationEmbedder
 from mijax.types import Tokens
+
+LONG_LIST = 256
+"""From so many observations on it is worth looking whether a batch shows but a quarter of them."""
 
 
 @struct.dataclass
@@ -24,9 +28,17 @@ class MemoryState:
     recurrent: Any  # keys and values of the GPT, or the hidden state of the GRU
 
 
-def frame_features(features: jax.Array, tokens: Tokens) -> jax.Array:
-    """Hand encoded frames (N, F) to the tokens that show them: (R L, F)."""
-    return features if tokens.frame is None else features[tokens.frame.reshape(-1)]
+def frame_features(encoder: ObservationEmbedder | Encoder, tokens: Tokens) -> jax.Array:
+    """What the encoder says of the observation of every token: (R L, F)."""
+    if not isinstance(tokens.frames, FrameTable):
+        return encoder(tokens.frames)
+    index = cast(jax.Array, tokens.frame).reshape(-1)
+    every, count = tokens.frames.prepared(encoder.layers), len(tokens.frames)
+    if count < LONG_LIST:
+        return encoder(every)[index]
+    few, present, place = keep_present(index, count, count // 4)
+    return nn.cond(
+        few, lambda module: module(take(every, present))[place], lambda module: module(every)[index], encoder)
 
 
 class HistoryEncoder(nn.Module):
@@ -49,7 +61,7 @@ class HistoryEncoder(nn.Module):
 
     def __call__(self, tokens: Tokens, deterministic: bool = True) -> jax.Array:
         """(R L, W) a summary of the history at every token."""
-        observation = frame_features(self.embed_observation(tokens.frames), tokens)
+        observation = frame_features(self.embed_observation, tokens)
         x = jnp.concatenate([self.embed_action(tokens.previous_action.reshape(-1)), observation], axis=-1)
         return self.sequence(x, tokens.segment, tokens.position, deterministic)
 
@@ -98,7 +110,7 @@ class TwoBranchQ(nn.Module):
     def __call__(self, tokens: Tokens, deterministic: bool = True) -> tuple[jax.Array, jax.Array | None]:
         """(R, L, A) action values and, with the auxiliary task, (R, L, F) the predicted z_s."""
         summary = self.top(tokens, deterministic)
-        z_o = frame_features(self.bottom(tokens.frames), tokens)
+        z_o = frame_features(self.bottom, tokens)
         shape = tokens.segment.shape
         q = self.q_head(jnp.concatenate([summary, z_o.astype(summary.dtype)], axis=-1)).astype(jnp.float32)
         predicted = None

@@ -9,6 +9,7 @@ from flax import linen as nn
 
 from envs_mjx.base import ActionSpec, DiscreteActions, Environment
 from mijax.nets.encoders import Encoder, encoder_for
+from mijax.nets.frames import Frames
 from mijax.types import Params
 
 ACTION_WIDTH = 16
@@ -64,12 +65,12 @@ class Networks:
         return jnp.zeros((size, spec.num if isinstance(spec, DiscreteActions) else spec.size), jnp.float32)
 
 
-def evaluate(module: nn.Module, parameters: Params, *inputs: jax.Array, method: str | None = None) -> Any:
+def evaluate(module: nn.Module, parameters: Params, *inputs: Frames, method: str | None = None) -> Any:
     """What the module gives; Flax types it as possibly a tuple with mutated variables, which these never return."""
     return module.apply({"params": parameters}, *inputs, method=method)
 
 
-def local_features(encoder: Encoder, parameters: Params, discriminator: Params, x: jax.Array) -> jax.Array:
+def local_features(encoder: Encoder, parameters: Params, discriminator: Params, x: Frames) -> jax.Array:
     """z^l of Fig. 28, (..., F): the discriminator's own layers on top of the encoder's first block."""
     return evaluate(encoder, discriminator, evaluate(encoder, parameters, x, method="first_block"), method="finish")
 

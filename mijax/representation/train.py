@@ -22,6 +22,7 @@ from mijax.losses.club import club_all_pairs, gaussian_fit
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
 from mijax.nets.encoders import Encoder
+from mijax.nets.frames import Frames, Patches, keep_present, take_apart
 from mijax.representation.dataset import Transitions, TransitionTable, collect, tabulate
 from mijax.representation.model import Networks, evaluate, init_parameters, local_features, networks_for
 from mijax.types import Metrics, Params, Representation
@@ -29,8 +30,8 @@ from mijax.types import Metrics, Params, Representation
 ENCODER_NETWORKS = ("phi", "psi", "dynamics", "discriminator_s", "discriminator_o")
 STANDARDIZE_FLOOR = 1e-6
 """Added to the variance of a feature before dividing by it, as a fraction of the mean variance of all features."""
-FrameFunction = Callable[[jax.Array], jax.Array]
-"""(M, ...) frames -> (M, F)."""
+FrameFunction = Callable[[Frames], jax.Array]
+"""M frames -> (M, F)."""
 ProgressCallback = Callable[[int, dict[str, float]], None]
 """Called after each epoch with its number, from 1, and the metrics of its last batch."""
 
@@ -109,6 +110,20 @@ class Problem:
     data: Transitions
     table: TransitionTable
     row: jax.Array  # (N,) int32, row of `table` of each transition
+    states: Frames  # all distinct states, as phi reads them
+    observations: Frames  # all distinct observations, as psi reads them
+
+    @classmethod
+    def of(cls, env: Environment, config: Stage1Config, data: Transitions) -> "Problem":
+        """Everything about `data` that can be worked out before training."""
+
+        def prepared(encoder: Encoder, frames: jax.Array) -> Frames:
+            patches = take_apart(np.asarray(frames), encoder.layers, min(config.batch_size, frames.shape[0]))
+            return frames if patches is None else patches
+
+        networks = networks_for(env, config.features)
+        return cls(networks, config, data, *tabulate(data), prepared(networks.phi, data.states),
+                   prepared(networks.psi, data.observations))
 
     @property
     def updates_per_epoch(self) -> int:
@@ -162,24 +177,23 @@ def shrink(strength: float, step_size: optax.Schedule) -> optax.GradientTransfor
     return optax.GradientTransformation(init, update)
 
 
-def encode(function: FrameFunction, frames: jax.Array, index: jax.Array) -> jax.Array:
+def encode(function: FrameFunction, frames: Frames, index: jax.Array) -> jax.Array:
     """function(frames[index]), (B, F), for (B,) `index`, computed on as few frames as can be.
+
+    Images that are taken apart cost little each; these are all computed.
 
     All distinct frames of the data are encoded when there are no more of them than rows. Otherwise the distinct ones of
     this batch, when they fill at most a quarter of the data's or, for a data set of mostly different frames, all rows.
     """
+    if isinstance(frames, Patches):
+        return function(frames.take(index))
     count, capacity = frames.shape[0], frames.shape[0] // 4
     if count <= index.shape[0]:
         return function(frames)[index]
     if capacity >= index.shape[0]:
         return function(frames[index])
-    present = jnp.zeros(count, jnp.int32).at[index].set(1)
-    slot = jnp.cumsum(present) - 1
-
-    def of_distinct() -> jax.Array:
-        return function(frames[jnp.nonzero(present, size=capacity, fill_value=0)[0]])[slot[index]]
-
-    return jax.lax.cond(slot[-1] < capacity, of_distinct, lambda: function(frames[index]))
+    few, present, place = keep_present(index, count, capacity)
+    return jax.lax.cond(few, lambda: function(frames[present])[place], lambda: function(frames[index]))
 
 
 def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
@@ -194,14 +208,14 @@ def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
 
 def features(problem: Problem, parameters: dict[str, Params], rows: TransitionTable) -> Features:
     """z_s, z_o, their successors (constants), and what the discriminators say of the inputs: (B, F) each."""
-    networks, data, config = problem.networks, problem.data, problem.config
+    networks, config = problem.networks, problem.config
 
-    def both(encoder: Encoder, frames: jax.Array, index: jax.Array, next_index: jax.Array, name: str,
+    def both(encoder: Encoder, frames: Frames, index: jax.Array, next_index: jax.Array, name: str,
              discriminator: str | None) -> tuple[jax.Array, jax.Array, jax.Array | None]:
         weights = parameters[name]
         frozen = jax.lax.stop_gradient(weights)
 
-        def now(x: jax.Array) -> jax.Array:
+        def now(x: Frames) -> jax.Array:
             z = evaluate(encoder, weights, x)
             if discriminator is None:
                 return z
@@ -211,9 +225,9 @@ def features(problem: Problem, parameters: dict[str, Params], rows: TransitionTa
         next_z = encode(lambda x: evaluate(encoder, frozen, x), frames, next_index)
         return z, next_z, local[0] if local else None
 
-    z_s, next_z_s, local_s = both(networks.phi, data.states, rows.state, rows.next_state, "phi",
+    z_s, next_z_s, local_s = both(networks.phi, problem.states, rows.state, rows.next_state, "phi",
                                   "discriminator_s" if config.lambda_dim_s > 0 else None)
-    z_o, next_z_o, local_o = both(networks.psi, data.observations, rows.observation, rows.next_observation, "psi",
+    z_o, next_z_o, local_o = both(networks.psi, problem.observations, rows.observation, rows.next_observation, "psi",
                                   "discriminator_o" if config.lambda_dim_o > 0 else None)
     return Features(z_s=z_s, z_o=z_o, next_z_s=next_z_s, next_z_o=next_z_o, local_s=local_s, local_o=local_o)
 
@@ -324,7 +338,7 @@ def train_on(
     if data.size < config.batch_size:
         raise ConfigError(f"--stage1.batch-size: got {config.batch_size}, accepted: at most the {data.size} "
                           f"transitions of --stage1.episodes {config.episodes}")
-    problem = Problem(networks_for(env, config.features), config, data, *tabulate(data))
+    problem = Problem.of(env, config, data)
     state, epoch = initial_state(problem, init_key), make_epoch(problem)
     seen: list[dict[str, float]] = []
     started = compiled = time.perf_counter()

@@ -59,6 +59,9 @@ class Stage1Config:
     """Weight of the lower bound of I(o; z_o), which is maximised."""
     estimator_updates: int = 5
     """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
+    rewarded: int = 0
+    """Rewarded transitions added to every batch, for the reward loss alone, which then weighs rewarded and unrewarded
+    ones alike. For rewards so rare that a batch hardly holds one; 0 is the paper's loss."""
     phi_shrinkage: float = 0.1
     """How far each weight of phi is pulled towards 0 in an update, in units of the step size (a proximal L1 penalty).
     Position that z_o already carries then leaves z_s exactly, below what CLUB's q can see. 0 is the paper's plain Adam,
@@ -68,7 +71,7 @@ class Stage1Config:
         _require_at_least("stage1.", self, 1, "episodes", "heldout_episodes", "epochs", "batch_size", "features",
                           "estimator_updates")
         _require_at_least("stage1.", self, 0, "lambda_r", "lambda_s", "lambda_o", "lambda_club", "lambda_dim_s",
-                          "lambda_dim_o", "phi_shrinkage")
+                          "lambda_dim_o", "rewarded", "phi_shrinkage")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
 
 

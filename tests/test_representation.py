@@ -19,7 +19,7 @@ from mijax.representation.dataset import Transitions, collect, tabulate
 from mijax.representation.model import evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
 from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
-from mijax.representation.train import encode, shrink
+from mijax.representation.train import Problem, encode, shrink
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
 
@@ -137,6 +137,25 @@ def test_images_train_in_both_ways_of_batching():
         assert history.updates >= 1
         frames = jnp.zeros((2, 3, *sphinx.observation_spec.shape), jnp.uint8)
         assert encode_observation(representation, sphinx, frames).shape == (2, 3, 4)
+
+
+@pytest.mark.parametrize("batch_size", [40, 4000])  # fewer rows than distinct transitions, and more
+def test_rewarded_transitions_weigh_in_the_reward_loss_alone(env, batch_size):
+    config = dataclasses.replace(SMALL, episodes=100, batch_size=batch_size, rewarded=7)
+    data = collect(env, jax.random.key(3), config.episodes)
+    problem = Problem.of(env, config, data)
+    reward = np.asarray(problem.table.reward)
+    assert set(problem.rewarded.tolist()) == set(np.flatnonzero(reward))
+    common = np.flatnonzero(np.asarray(data.reward) == 0)
+    chosen = jnp.asarray(np.resize(common, batch_size))
+    batch = jax.jit(problem.batch)(chosen, jax.random.key(0))
+    rewarded = np.asarray(batch.rows.reward) != 0
+    assert np.asarray(batch.weight)[rewarded].sum() == 0
+    np.testing.assert_allclose([batch.weight.sum(), batch.reward_weight.sum()], 1, rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(batch.reward_weight)[rewarded].sum(), 0.5, rtol=1e-5)
+    paper = dataclasses.replace(problem, config=dataclasses.replace(config, rewarded=0))
+    plain = paper.batch(chosen, jax.random.key(0))
+    np.testing.assert_array_equal(plain.weight, plain.reward_weight)
 
 
 @pytest.mark.lenient

@@ -71,10 +71,11 @@ class TrainState:
 
 @struct.dataclass
 class Batch:
-    """Distinct transitions of a batch."""
+    """Distinct transitions of a batch, B' of them."""
 
-    rows: TransitionTable  # (K,) or (B,) each
-    weight: jax.Array  # (K,) or (B,) float32, probability of each row in the batch; sums to one
+    rows: TransitionTable  # (B',) each
+    weight: jax.Array  # (B',) float32, probability of each row in the batch; sums to one
+    reward_weight: jax.Array  # (B',) float32, the same for the reward loss
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +113,7 @@ class Problem:
     row: jax.Array  # (N,) int32, row of `table` of each transition
     states: Frames  # all distinct states, as phi reads them
     observations: Frames  # all distinct observations, as psi reads them
+    rewarded: jax.Array  # (W,) int32, rows of `table` whose reward is not the most common one
 
     @classmethod
     def of(cls, env: Environment, config: Stage1Config, data: Transitions) -> "Problem":
@@ -121,21 +123,34 @@ class Problem:
             patches = take_apart(np.asarray(frames), encoder.layers, min(config.batch_size, frames.shape[0]))
             return frames if patches is None else patches
 
-        networks = networks_for(env, config.features)
-        return cls(networks, config, data, *tabulate(data), prepared(networks.phi, data.states),
-                   prepared(networks.psi, data.observations))
+        networks, (table, row) = networks_for(env, config.features), tabulate(data)
+        rewards, count = np.unique(data.reward, return_counts=True)
+        rewarded = np.flatnonzero(table.reward != rewards[np.argmax(count)]).astype(np.int32)
+        return cls(networks, config, data, table, row, prepared(networks.phi, data.states),
+                   prepared(networks.psi, data.observations), jnp.asarray(rewarded))
 
     @property
     def updates_per_epoch(self) -> int:
         """Whole batches in the data set."""
         return self.data.size // self.config.batch_size
 
-    def batch(self, chosen: jax.Array) -> Batch:
-        """The batch of (B,) chosen transitions."""
+    def batch(self, chosen: jax.Array, key: jax.Array) -> Batch:
+        """The batch of (B,) chosen transitions, and of the rewarded ones that `key` draws."""
         rows, size = self.row[chosen], self.config.batch_size
+        extra = self.config.rewarded if self.rewarded.size else 0
+        added = self.rewarded[jax.random.randint(key, (extra,), 0, self.rewarded.size)] if extra else rows[:0]
         if self.table.size <= size:
-            return Batch(self.table, jnp.zeros(self.table.size, jnp.float32).at[rows].add(1 / size))
-        return Batch(jax.tree.map(lambda column: column[rows], self.table), jnp.full(size, 1 / size, jnp.float32))
+            nothing = jnp.zeros(self.table.size, jnp.float32)
+            table, weight, drawn = self.table, nothing.at[rows].add(1 / size), nothing.at[added].add(1.0)
+        else:
+            table = jax.tree.map(lambda column: column[jnp.concatenate([rows, added])], self.table)
+            weight = jnp.asarray(np.repeat([1 / size, 0.0], [size, extra]), jnp.float32)
+            drawn = (weight == 0).astype(jnp.float32)
+        if not extra:
+            return Batch(table, weight, weight)
+        rewarded = drawn > 0
+        common = jnp.where(rewarded, 0.0, weight)
+        return Batch(table, weight, 0.5 * drawn / extra + 0.5 * common / jnp.maximum(jnp.sum(common), 1 / size))
 
 
 def optimizers(config: Stage1Config, updates: int) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
@@ -253,7 +268,7 @@ def encoder_loss(
         networks.dynamics, parameters["dynamics"], f.z_s, f.z_o, networks.encode_action(rows.action))
     mean, log_variance = evaluate(networks.estimator, fit.parameters, standardize(f.z_s, weight))
     terms = {
-        "reward_loss": (config.lambda_r, reward_loss(reward, rows.reward, weight)[0]),
+        "reward_loss": (config.lambda_r, reward_loss(reward, rows.reward, batch.reward_weight)[0]),
         "z_s_loss": (config.lambda_s, next_feature_loss(predicted_z_s, f.next_z_s, rows.terminal, weight)[0]),
         "z_o_loss": (config.lambda_o, next_feature_loss(predicted_z_o, f.next_z_o, rows.terminal, weight)[0]),
         "club": (config.lambda_club, club_all_pairs(standardize(f.z_o, weight), mean, log_variance, weight)[0]),
@@ -299,9 +314,9 @@ def make_epoch(problem: Problem) -> Callable[[TrainState, jax.Array], tuple[Trai
     updates = problem.updates_per_epoch
     optimizer, estimator_optimizer = optimizers(config, config.epochs * updates)
 
-    def update(state: TrainState, chosen: jax.Array) -> tuple[TrainState, Metrics]:
+    def update(state: TrainState, draw: tuple[jax.Array, jax.Array]) -> tuple[TrainState, Metrics]:
         gradients, (fit, metrics) = jax.grad(encoder_loss, has_aux=True)(
-            state.parameters, state.estimator, problem, problem.batch(chosen), estimator_optimizer)
+            state.parameters, state.estimator, problem, problem.batch(*draw), estimator_optimizer)
         step, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
         parameters = cast(dict[str, Params], optax.apply_updates(state.parameters, step))
         return TrainState(parameters, optimizer_state, fit), metrics
@@ -309,7 +324,8 @@ def make_epoch(problem: Problem) -> Callable[[TrainState, jax.Array], tuple[Trai
     @jax.jit
     def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
         order = jax.random.permutation(key, problem.data.size)[: updates * config.batch_size]
-        state, metrics = jax.lax.scan(update, state, order.reshape(updates, config.batch_size))
+        draws = order.reshape(updates, config.batch_size), jax.random.split(jax.random.fold_in(key, 1), updates)
+        state, metrics = jax.lax.scan(update, state, draws)
         return state, jax.tree.map(lambda value: value[-1], metrics)
 
     return epoch

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec
+from jax.sharding import AxisType, PartitionSpec
 
 from envs_mjx.base import Environment
 from mijax.config import Stage1Config
@@ -202,7 +202,8 @@ def map_members(
     devices = max(d for d in range(1, len(jax.local_devices()) + 1) if count % d == 0)
     if devices == 1:
         return jax.jit(in_turn, donate_argnums=1)
-    mesh, over, same = jax.make_mesh((devices,), ("members",)), PartitionSpec("members"), PartitionSpec()
+    mesh = jax.make_mesh((devices,), ("members",), axis_types=(AxisType.Auto,))
+    over, same = PartitionSpec("members"), PartitionSpec()
     return jax.jit(jax.shard_map(in_turn, mesh=mesh, in_specs=(over, over, same), out_specs=over, check_vma=False),
                    donate_argnums=1)
 

@@ -5,6 +5,7 @@ Letters: N episodes, L = horizon + 1 tokens, A actions, F features, H attention 
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 from typing import Any, cast
 
 import jax
@@ -166,12 +167,44 @@ def draw_episode(trace: Trace, index: int, env: Environment, path: pathlib.Path,
         if peak is not None:
             assert trace.bonus is not None
             axes[0].plot(peak, weight * trace.bonus[index, peak], **RING)
+            axes[0].margins(y=0.15)
         axes[-1].set_xlabel("step (blue: the observation shows what is otherwise hidden)")
         axes[-1].set_xlim(-0.5, steps[-1] + 0.5)
         axes[-1].xaxis.set_major_locator(MaxNLocator(10, integer=True))
         figure.suptitle(title, fontsize=12, fontweight="bold", ha="left", x=0.01)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)
+
+
+def draw_bonuses(episodes: Sequence[tuple[str, float, Trace, int]], path: pathlib.Path, *, title: str,
+                 note: str = "") -> None:
+    """Draw the intrinsic reward within one episode of each of some agents, side by side (paper Fig. 32).
+
+    Args:
+        episodes: of each panel its title, the weight of the bonus, a trace and which of its episodes.
+        path: of the PNG.
+        title: of the figure.
+        note: printed under it.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(max(4.2, 0.8 + 3.4 * len(episodes)), 3.2), layout="constrained")
+        for axis, (name, weight, seen, index) in zip(
+                np.ravel(figure.subplots(1, len(episodes), squeeze=False)), episodes, strict=True):
+            assert seen.bonus is not None
+            steps = np.arange(seen.length[index] + 1)
+            axis.plot(steps, weight * seen.bonus[index][steps], color=AGENT_COLOURS["mi"], marker=".")
+            peak = int(seen.peaks()[index])
+            axis.plot(peak, weight * seen.bonus[index, peak], **RING)
+            for step in steps[seen.reveals[index][steps]]:
+                axis.axvspan(step - 0.5, step + 0.5, color=_INFORMATION, alpha=0.35, linewidth=0)
+            axis.margins(y=0.15)
+            axis.set(title=name, xlabel="step (blue: information shown)", ylabel="intrinsic reward")
+            axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        figure.suptitle(title, fontsize=12, fontweight="bold", ha="left", x=0.01)
+        if note:
+            figure.text(0.01, -0.01, note, fontsize=7.5, color="#666666", ha="left", va="top")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, bbox_inches="tight")
 
 
 def _draw_rewards(axis: Axes, trace: Trace, index: int, env: Environment, weight: float) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -145,6 +145,53 @@ def _add_texts(figure: Figure, axes: np.ndarray, runs: Sequence[ReportedRun], no
 def display_name(domain: str) -> str:
     """A domain as titles show it."""
     return domain.rpartition(":")[2] if ":" in domain else domain.replace("_", " ").title()
+
+
+def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path, *, title: str, note: str = "",
+                starts: Mapping[str, Mapping[str, int]] | None = None, panel: Panel = RETURN_AND_SUCCESS[1]) -> None:
+    """Draw groups of runs side by side: above mean and standard deviation as in the paper, below interquartile means.
+
+    Args:
+        groups: the runs of each column, by its title.
+        path: of the PNG.
+        title: of the figure.
+        note: printed under the figure: budgets and seeds.
+        starts: by group and label, the environment steps that came before the run: its curve begins there, at a dashed
+            vertical line.
+        panel: the quantity.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(max(4.2, 0.8 + 3.5 * len(groups)), 5.6), layout="constrained")
+        axes = figure.subplots(2, len(groups), sharey=True, sharex="col", squeeze=False)
+        for (name, runs), column in zip(groups.items(), axes.T, strict=True):
+            offsets = (starts or {}).get(name, {})
+            for axis, draw in zip(column, (_draw_mean, _draw_interquartile_mean), strict=True):
+                for run in runs:
+                    offset = offsets.get(run.label, 0)
+                    curves = [(steps + offset, values) for steps, values in run.curves(panel.metric)]
+                    if curves:
+                        draw(axis, run, curves, faint=0.6 if len(runs) > 3 else 1.0)
+                for start in {start for start in offsets.values() if start}:
+                    axis.axvline(start, color="#888888", linewidth=0.9, linestyle=(0, (2, 2)), zorder=1.2)
+                _draw_optimum(axis, runs, panel)
+            column[0].set_title(name)
+            _label_steps(column[-1], runs, (panel,))
+            column[-1].set_xlim(0, column[-1].get_xlim()[1] + max(offsets.values(), default=0))
+        for axis, name in zip(axes[:, 0], ("mean, one standard deviation", "interquartile mean, 95 % interval"),
+                              strict=True):
+            axis.set_ylabel(f"{panel.label}\n{name}")
+            if panel.limits:
+                axis.set_ylim(*panel.limits)
+        entries = {}
+        for axis in axes[0]:
+            handles, labels = axis.get_legend_handles_labels()
+            entries = dict(zip(labels, handles, strict=True)) | entries
+        figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=4, handlelength=1.6)
+        figure.suptitle(title, fontsize=12, fontweight="bold", ha="left", x=0.01)
+        if note:
+            figure.text(0.01, -0.01, note, fontsize=7.5, color="#666666", ha="left", va="top")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, bbox_inches="tight")
 
 
 def draw_trade_off(result: SearchResult, path: pathlib.Path, title: str) -> None:

@@ -46,6 +46,7 @@ class Request:
     """What was asked for."""
 
     out: pathlib.Path
+    domain: str | None
     seeds: tuple[int, ...]
     steps: int | None
     extra: tuple[str, ...]
@@ -174,6 +175,8 @@ def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
             starts[title] = {arm.label: stage1_samples(request, domain, arm) for arm in arms}
             steps[domain] = request.parse(domain, arms[0]).config.steps
         note = note_on(request, domains[:number], steps)
+        if any(start for group in starts.values() for start in group.values()):
+            note += ". Dashed vertical: stage 1's random steps end, task learning starts"
         figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note, starts=starts)
         write_table(name, request, experiment.title, groups, note)
 
@@ -190,7 +193,8 @@ def write_table(name: str, request: Request, title: str, groups: dict[str, list[
 
 def command_line(name: str, request: Request) -> str:
     """What makes this result again."""
-    parts = [f"python -m launch.paper {name}", f"--seeds {','.join(map(str, request.seeds))},"]
+    parts = [f"python -m launch.paper {name}", *([] if request.domain is None else [f"--domain {request.domain}"])]
+    parts += [f"--seeds {','.join(map(str, request.seeds))},"]
     parts += [] if request.steps is None else [f"--steps {request.steps}"]
     return " ".join([*parts, *request.extra])
 
@@ -248,7 +252,7 @@ def plan(what: str, domain: str | None) -> list[tuple[str, tuple[str, ...]]]:
             if GRID_WORLDS[number - 1] in EXPERIMENTS[name].domains]
 
 
-def parse(arguments: Sequence[str]) -> tuple[str, str | None, Request]:
+def parse(arguments: Sequence[str]) -> tuple[str, Request]:
     """The command line; what it does not know is passed on to `mijax.train`."""
     parser = argparse.ArgumentParser(
         prog="python -m launch.paper", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -268,16 +272,17 @@ def parse(arguments: Sequence[str]) -> tuple[str, str | None, Request]:
             "nothing here, the experiment sets it")
     if known.domain is not None:
         registry.make(known.domain)
-    return known.experiment, known.domain, Request(known.out, parse_seeds(known.seeds), known.steps, tuple(extra))
+    seeds = parse_seeds(known.seeds)
+    return known.experiment, Request(known.out, known.domain, seeds, known.steps, tuple(extra))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
     try:
-        what, domain, request = parse(sys.argv[1:] if arguments is None else arguments)
+        what, request = parse(sys.argv[1:] if arguments is None else arguments)
         runtime.prepare(host_devices=min(runtime.cores(), len(request.seeds)))
         request.out.mkdir(parents=True, exist_ok=True)
-        for name, domains in plan(what, domain):
+        for name, domains in plan(what, request.domain):
             SAY(f"== {name}: {EXPERIMENTS[name].title}: {', '.join(domains)}")
             (run_intrinsic if name == "fig32" else run_curves)(name, request, domains)
     except (*train.USER_ERRORS, OSError) as error:

@@ -202,9 +202,9 @@ def draw_bonuses(episodes: Sequence[tuple[str, float, Trace, int]], path: pathli
             axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         figure.suptitle(title, fontsize=12, fontweight="bold", ha="left", x=0.01)
         if note:
-            figure.text(0.01, -0.01, note, fontsize=7.5, color="#666666", ha="left", va="top")
+            figure.supxlabel(note, x=0.01, ha="left", fontsize=7.5, color="#666666")
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, bbox_inches="tight")
+        figure.savefig(path)
 
 
 def _draw_rewards(axis: Axes, trace: Trace, index: int, env: Environment, weight: float) -> None:

@@ -162,7 +162,7 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(max(4.2, 0.8 + 3.5 * len(groups)), 5.6), layout="constrained")
-        axes = figure.subplots(2, len(groups), sharey=True, sharex="col", squeeze=False)
+        axes, entries = figure.subplots(2, len(groups), sharey=True, sharex="col", squeeze=False), {}
         for (name, runs), column in zip(groups.items(), axes.T, strict=True):
             offsets = (starts or {}).get(name, {})
             for axis, draw in zip(column, (_draw_mean, _draw_interquartile_mean), strict=True):
@@ -177,21 +177,21 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
             column[0].set_title(name)
             _label_steps(column[-1], runs, (panel,))
             column[-1].set_xlim(0, column[-1].get_xlim()[1] + max(offsets.values(), default=0))
+            entries |= dict(zip(*reversed(column[0].get_legend_handles_labels()), strict=True))
         for axis, name in zip(axes[:, 0], ("mean, one standard deviation", "interquartile mean, 95 % interval"),
                               strict=True):
             axis.set_ylabel(f"{panel.label}\n{name}")
             if panel.limits:
                 axis.set_ylim(*panel.limits)
-        entries = {}
-        for axis in axes[0]:
-            handles, labels = axis.get_legend_handles_labels()
-            entries = dict(zip(labels, handles, strict=True)) | entries
-        figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=4, handlelength=1.6)
-        figure.suptitle(title, fontsize=12, fontweight="bold", ha="left", x=0.01)
+        entries["optimum"] = entries.pop("optimum", None)  # last
+        entries = {label: handle for label, handle in entries.items() if handle is not None}
+        legend = figure.legend(list(entries.values()), list(entries), loc="outside upper left", handlelength=1.6,
+                               ncols=2 if len(groups) == 1 else 2 * len(groups), title=title, alignment="left")
+        legend.get_title().set(fontsize=12, fontweight="bold")
         if note:
-            figure.text(0.01, -0.01, note, fontsize=7.5, color="#666666", ha="left", va="top")
+            figure.supxlabel(note, x=0.01, ha="left", fontsize=7.5, color="#666666")
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, bbox_inches="tight")
+        figure.savefig(path)
 
 
 def draw_trade_off(result: SearchResult, path: pathlib.Path, title: str) -> None:

@@ -161,7 +161,8 @@ def comparison_markdown(runs: Sequence[ReportedRun]) -> str:
         cells = {"run": line["run"], "seeds": str(line["seeds"])}
         for name in ("success", "return", "reveals", "area"):
             if f"{name}_mean" in line:
-                cells[name] = f"{readable(line[f'{name}_mean'])} ± {readable(line[f'{name}_std'])}"
+                spread = f" ± {readable(line[f'{name}_std'])}" if line["seeds"] > 1 else ""
+                cells[name] = f"{readable(line[f'{name}_mean'])}{spread}"
         if "success_iqm" in line:
             cells |= {"success, IQM": readable(line["success_iqm"]), "area, IQM": readable(line.get("area_iqm"))}
         cells["solved"] = f"{line['solved']}/{line['seeds']}"

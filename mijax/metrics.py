@@ -3,7 +3,7 @@
     RUN/config.json             the run's options; the last file of a new folder, so that it marks a whole one
     RUN/versions.json           python, packages, platform, commit
     RUN/seed_K/metrics.jsonl    one JSON object per evaluation
-    RUN/summary.json            at the end: see `mijax.report.summarise`
+    RUN/summary.json            at the end: see `mijax.results.summarise`
     RUN/curve.png
 
 A line of metrics has `step` (environment steps of this seed) and numbers by name. A number under `wall/` is the seconds

@@ -1,4 +1,7 @@
-"""`python -m mijax.represent`: stage 1 alone, for any number of seeds, each probed and kept."""
+"""`python -m mijax.represent`: stage 1 alone, for any number of seeds, each probed and kept.
+
+With `--search 16` it chooses the loss weights first: many weightings are trained at once, the best is kept.
+"""
 
 import argparse
 import dataclasses
@@ -12,7 +15,7 @@ import tyro
 import configs
 from envs_mjx import registry
 from mijax import runtime, stage1
-from mijax.config import ConfigError, Stage1Config, parse_seeds
+from mijax.config import ConfigError, Stage1Config, parse_seeds, require
 from mijax.metrics import RunError, RunFolder
 from mijax.representation import DivergenceError
 from mijax.representation.storage import RepresentationError
@@ -31,6 +34,9 @@ class RepresentOptions:
     """A registered environment, or `package.module:EnvClass`."""
     seeds: Annotated[str, tyro.conf.arg(name="seeds")] = "1"
     """How many seeds (5: seeds 0 to 4), or which ones (3,7; a single one with a comma: 3,)."""
+    search: int = 0
+    """How many loss weightings to try in place of --stage1.lambda-* and --stage1.phi-shrinkage (a DIM weight of 0 stays
+    0). 0: none, the weights are taken as they are."""
     out: pathlib.Path | None = None
     """Run folder to make; default runs/DOMAIN-representation. `mijax.train --representation` reads it."""
 
@@ -47,17 +53,23 @@ def parse(arguments: Sequence[str]) -> RepresentOptions:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 when all went well, also if a representation fails its probe."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
-    runtime.prepare()
+    runtime.prepare(host_devices=runtime.cores() if options.search else 1)
     try:
+        require(options.search >= 0, "search", options.search, "a number >= 1, or 0 for none")
         seeds, env = parse_seeds(options.seeds), registry.make(options.domain)
         name = f"{options.domain.replace(':', '.')}-representation"
         stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
         run = RunFolder.create(options.out or pathlib.Path("runs") / name, stored)
-        reports = [stage1.learn(run, env, options.stage1, seed, print) for seed in seeds]
+        if options.search:
+            found = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print)
+            passed = found.best.passed
+        else:
+            reports = [stage1.learn(run, env, options.stage1, seed, print) for seed in seeds]
+            passed = sum(report.p1 and report.p2 for report in reports)
     except USER_ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(f"{sum(report.p1 and report.p2 for report in reports)} of {len(reports)} representations pass P1 and P2")
+    print(f"{passed} of {len(seeds)} representations pass P1 and P2")
     return 0
 
 

@@ -4,19 +4,23 @@ import json
 import pathlib
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 
 from envs_mjx.base import Environment
+from mijax import figures
 from mijax.config import Stage1Config
 from mijax.metrics import ProgressDisplay, RunError, RunFolder
-from mijax.representation import learn_representation
+from mijax.representation import DivergenceError, learn_representation
 from mijax.representation.probe import ProbeReport, format_report, probe
+from mijax.representation.search import SearchResult, draw_candidates, search
 from mijax.representation.storage import FACTS_FILE, load_representation, save_representation, write_atomically
 from mijax.types import Representation
 
 FOLDER = "representation"
 PROBE_FILE = "probe.json"
+SEARCH_FILE, TRADE_OFF_FILE = "search.json", "trade_off.png"
 
 
 def representation_key(seed: int) -> jax.Array:
@@ -63,10 +67,40 @@ def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say
     with ProgressDisplay(f"stage 1, seed {seed}", config.epochs, unit="epochs") as progress:
         representation, history = learn_representation(env, config, key, on_progress=progress.update)
     report = probe(representation, env, config, jax.random.fold_in(key, 1), history)
-    save_representation(representation, env, folder)
     timing = {"updates": history.updates, "updates_per_second": history.updates_per_second,
               "compile_seconds": history.compile_seconds, "seconds": history.seconds}
-    write_atomically(folder / PROBE_FILE, json.dumps(report.as_dict() | timing, indent=2).encode())
+    _keep(folder, env, representation, report, timing)
     say(f"stage 1, seed {seed}: {history.updates} updates in {history.compile_seconds + history.seconds:.0f} s "
         f"({history.updates_per_second:.0f}/s), kept in {folder}\n{format_report(report)}")
     return report
+
+
+def choose_weights(
+    run: RunFolder, env: Environment, config: Stage1Config, seeds: tuple[int, ...], count: int,
+    say: Callable[[str], None]
+) -> SearchResult:
+    """Search `count` loss weightings, keep the best one's representations, the table and the figure of all."""
+    keys = {seed: representation_key(seed) for seed in seeds}
+    with ProgressDisplay(f"{count} weightings, {len(seeds)} seeds", config.epochs, unit="epochs") as progress:
+        result = search(env, config, draw_candidates(config, count), keys, on_progress=progress.update)
+    for seed, representation in result.best.representations.items():
+        report = result.best.reports[seed]
+        if report is None:
+            raise DivergenceError(f"stage 1: every weighting that was kept diverged with seed {seed}; try a smaller "
+                                  f"--stage1.learning-rate than {config.learning_rate}")
+        _keep(folder_of(run, seed), env, representation, report, {"weights": result.best.weights})
+        say(f"seed {seed}, kept in {folder_of(run, seed)}\n{format_report(report)}")
+    write_atomically(run.path / SEARCH_FILE, json.dumps(result.as_dict(), indent=2).encode())
+    figures.draw_trade_off(result, run.path / TRADE_OFF_FILE, f"{figures.display_name(env.name)}: {count} weightings, "
+                           f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}, {config.epochs} epochs")
+    flags = " ".join(f"--stage1.{name.replace('_', '-')} {value:g}" for name, value in result.best.weights.items())
+    say(f"{count} weightings in {result.seconds:.0f} s; the best: {flags}\nAll of them: {run.path / SEARCH_FILE}, "
+        f"{run.path / TRADE_OFF_FILE}")
+    return result
+
+
+def _keep(
+    folder: pathlib.Path, env: Environment, representation: Representation, report: ProbeReport, facts: dict[str, Any]
+) -> None:
+    save_representation(representation, env, folder)
+    write_atomically(folder / PROBE_FILE, json.dumps(report.as_dict() | facts, indent=2).encode())

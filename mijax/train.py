@@ -26,6 +26,7 @@ from mijax.learner import make_learner
 from mijax.metrics import ProgressDisplay, RunError, RunFolder, TrackerName, make_tracker
 from mijax.representation import DivergenceError
 from mijax.representation.storage import RepresentationError
+from mijax.results import load, summarise
 from mijax.seeds import SeedRunner, training_key
 
 FINAL_EPISODES = 500
@@ -268,14 +269,14 @@ def _conclude(
         "return": best.undiscounted_return, "discounted_return": best.discounted_return, "success": best.success,
         "length": best.length}
     wall = {seed: {"stage1": stage1_seconds.get(seed, 0.0)} for seed in runner.seeds}
-    summary = report.summarise(run, optimum=values, final=final, wall=wall)
+    summary = summarise(run, optimum=values, final=final, wall=wall)
     environment = runner.environment_seconds() / len(runner.seeds)
     for result in summary["seeds"].values():
         training = result["wall"].pop("training", 0.0)
         result["wall"]["environment"] = min(environment, training)
         result["wall"]["update"] = training - result["wall"]["environment"]
     run.write_summary(summary)
-    say(report.write_report(report.load([run.path]), run.path))
+    say(report.write_report(load([run.path]), run.path))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

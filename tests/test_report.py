@@ -5,7 +5,7 @@ import csv
 import pytest
 from PIL import Image
 
-from mijax import report
+from mijax import report, results
 from mijax.metrics import RunError, RunFolder
 
 OPTIMUM = {"return": 1.0, "discounted_return": 0.8, "success": 1.0}
@@ -23,7 +23,7 @@ def make_run(path, *, agent="mi", memory="gpt", domain="heaven_hell", seeds=(0, 
                 "wall/evaluation": 0.5, "wall/update": 2.0,
             })
     if finished:
-        run.write_summary(report.summarise(run, optimum=OPTIMUM, wall={seed: {"compile": 7.0} for seed in seeds}))
+        run.write_summary(results.summarise(run, optimum=OPTIMUM, wall={seed: {"compile": 7.0} for seed in seeds}))
     return run
 
 
@@ -33,7 +33,7 @@ def read_csv(path):
 
 
 def test_summary(tmp_path):
-    summary = report.summarise(make_run(tmp_path / "a", seeds=(0, 7)), optimum=OPTIMUM,
+    summary = results.summarise(make_run(tmp_path / "a", seeds=(0, 7)), optimum=OPTIMUM,
                                final={0: {"success": 0.99, "discounted_return": 0.6}}, wall={7: {"compile": 7.0}})
     assert (summary["domain"], summary["agent"], summary["memory"]) == ("heaven_hell", "mi", "gpt")
     first, second = summary["seeds"]["0"], summary["seeds"]["7"]
@@ -49,9 +49,9 @@ def test_summary(tmp_path):
 
 
 def test_summary_without_optimum(tmp_path):
-    seed = report.summarise(make_run(tmp_path / "a", seeds=(0,)))["seeds"]["0"]
+    seed = results.summarise(make_run(tmp_path / "a", seeds=(0,)))["seeds"]["0"]
     assert seed["fraction_of_optimum"] is None
-    assert report.summarise(make_run(tmp_path / "b"))["optimum"] is None
+    assert results.summarise(make_run(tmp_path / "b"))["optimum"] is None
 
 
 def test_report_of_one_run_goes_into_it(tmp_path, capsys):
@@ -65,7 +65,7 @@ def test_report_of_one_run_goes_into_it(tmp_path, capsys):
 def test_tables(tmp_path):
     make_run(tmp_path / "a")
     make_run(tmp_path / "b", agent="base", solved_at=9, finished=False)
-    runs = report.load([tmp_path / "a", tmp_path / "b"])
+    runs = results.load([tmp_path / "a", tmp_path / "b"])
     text = report.write_report(runs, tmp_path / "out")
     ours, theirs = read_csv(tmp_path / "out" / "runs.csv")
     assert (ours["run"], theirs["run"]) == ("mi", "base")
@@ -91,12 +91,12 @@ def dominant_colours(path):
 def test_agents_keep_their_colours(tmp_path):
     for agent in ("mi", "base", "zp"):
         make_run(tmp_path / agent, agent=agent, solved_at={"mi": 1, "base": 4, "zp": 6}[agent])
-    report.write_report(report.load([tmp_path / "zp", tmp_path / "mi", tmp_path / "base"]), tmp_path / "all", smooth=2)
-    report.write_report(report.load([tmp_path / "base"]), tmp_path / "one", note="cut short")
+    report.write_report(results.load([tmp_path / "zp", tmp_path / "mi", tmp_path / "base"]), tmp_path / "all", smooth=2)
+    report.write_report(results.load([tmp_path / "base"]), tmp_path / "one", note="cut short")
     shown = dominant_colours(tmp_path / "all" / "curve.png")
-    assert {report.AGENT_COLOURS[agent] for agent in ("mi", "base", "zp")} <= shown
-    assert report.AGENT_COLOURS["base"] in dominant_colours(tmp_path / "one" / "curve.png")
-    assert report.AGENT_COLOURS["mi"] not in dominant_colours(tmp_path / "one" / "curve.png")
+    assert {results.AGENT_COLOURS[agent] for agent in ("mi", "base", "zp")} <= shown
+    assert results.AGENT_COLOURS["base"] in dominant_colours(tmp_path / "one" / "curve.png")
+    assert results.AGENT_COLOURS["mi"] not in dominant_colours(tmp_path / "one" / "curve.png")
 
 
 def test_labels_tell_runs_apart(tmp_path):
@@ -104,18 +104,18 @@ def test_labels_tell_runs_apart(tmp_path):
     make_run(tmp_path / "gru", memory="gru")
     make_run(tmp_path / "again")
     paths = [tmp_path / name for name in ("gpt", "gru", "again")]
-    assert [run.label for run in report.load(paths[:2])] == ["mi (gpt)", "mi (gru)"]
-    runs = report.load(paths)
+    assert [run.label for run in results.load(paths[:2])] == ["mi (gpt)", "mi (gru)"]
+    runs = results.load(paths)
     assert [run.label for run in runs] == ["gpt", "gru", "again"]
     assert len({run.colour for run in runs}) == 3
-    assert runs[0].colour == report.AGENT_COLOURS["mi"]
-    assert [run.label for run in report.load(paths, ["x", "y", "z"])] == ["x", "y", "z"]
+    assert runs[0].colour == results.AGENT_COLOURS["mi"]
+    assert [run.label for run in results.load(paths, ["x", "y", "z"])] == ["x", "y", "z"]
 
 
 def test_domains_have_figures_of_their_own(tmp_path):
     make_run(tmp_path / "a")
     make_run(tmp_path / "b", domain="mine.envs:Maze", seeds=(0,))
-    runs = report.load([tmp_path / "a", tmp_path / "b"])
+    runs = results.load([tmp_path / "a", tmp_path / "b"])
     assert [run.label for run in runs] == ["mi, heaven_hell", "mi, mine.envs:Maze"]
     report.write_report(runs, tmp_path / "out")
     figures = {file.name for file in (tmp_path / "out").glob("*.png")}
@@ -125,7 +125,7 @@ def test_domains_have_figures_of_their_own(tmp_path):
 def test_curves_of_different_lengths_are_drawn(tmp_path):
     run = make_run(tmp_path / "a", finished=False)
     run.append(2, {"step": 12_345, "evaluation/success": 1.0})
-    report.write_report(report.load([run.path]), tmp_path / "out")
+    report.write_report(results.load([run.path]), tmp_path / "out")
     assert (tmp_path / "out" / "curve.png").stat().st_size > 10_000
 
 
@@ -146,4 +146,4 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, message
     assert message in error
     assert error.count("\n") == 1
     with pytest.raises(RunError):
-        report.load([tmp_path / "empty"])
+        results.load([tmp_path / "empty"])

@@ -32,14 +32,21 @@ def frame(env: Environment, env_state: GridState) -> np.ndarray:
     rows, columns = world.tables.shape
     image = Image.new("RGB", (columns * _CELL + 1, rows * _CELL + 1 + _CAPTION), _PAPER)
     draw = ImageDraw.Draw(image)
-    for row, column in np.ndindex(rows, columns):
-        x, y = column * _CELL, row * _CELL
-        draw.rectangle((x, y, x + _CELL, y + _CELL), fill=_COLOURS[kinds[row][column]], outline=_GRID)
+    _draw_cells(draw, kinds)
     row, column = divmod(int(env_state.cell), columns)
     x, y, margin = column * _CELL, row * _CELL, _CELL // 4
     draw.ellipse((x + margin, y + margin, x + _CELL - margin, y + _CELL - margin), fill=_AGENT)
     draw.text((4, rows * _CELL + 3), _caption(world, env_state), fill=_INK, font=ImageFont.load_default(size=12))
     return np.asarray(image)
+
+
+def background(env: Environment, env_state: GridState) -> np.ndarray:
+    """(height, width, 3) uint8: the world alone, a square of pixels per cell, to draw a path on."""
+    world, kinds = _layout(env, env_state)
+    rows, columns = world.tables.shape
+    image = Image.new("RGB", (columns * _CELL + 1, rows * _CELL + 1), _PAPER)
+    _draw_cells(ImageDraw.Draw(image), kinds)
+    return np.asarray(image)[:-1, :-1]
 
 
 def text(env: Environment, env_state: GridState) -> str:
@@ -57,6 +64,13 @@ def save_gif(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: fl
     images = [Image.fromarray(picture).quantize(64, dither=Image.Dither.NONE) for picture in frames]
     durations = [round(1000 / fps)] * (len(images) - 1) + [1000]  # milliseconds
     images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
+
+
+def _draw_cells(draw: ImageDraw.ImageDraw, kinds: list[list[str]]) -> None:
+    for row, line in enumerate(kinds):
+        for column, kind in enumerate(line):
+            x, y = column * _CELL, row * _CELL
+            draw.rectangle((x, y, x + _CELL, y + _CELL), fill=_COLOURS[kind], outline=_GRID)
 
 
 def _layout(env: Environment, env_state: GridState) -> tuple[GridWorld, list[list[str]]]:

@@ -48,8 +48,8 @@ class DQN:
         agent = dict(self.network.init(key_agent, tokens)["params"])
         if representation is not None and self.declaration.sees_state:
             agent |= {} if self.config.mdp.sees == "state" else {"phi": representation.phi, "psi": representation.psi}
-        elif representation is not None and self.config.information.start_from_psi:
-            agent["bottom"] = representation.psi
+        elif self.declaration.uses_representation and self.config.information.start_from_psi:
+            agent["bottom"] = cast(Representation, representation).psi
         params: dict[str, Params] = {"agent": agent}
         if self.information_model is not None:
             keys = jax.random.split(key_f, self.config.information.folds)

@@ -58,7 +58,9 @@ class Block(nn.Module):
 
         score = split(query) @ split(key).swapaxes(-1, -2) * width_head**-0.5
         score = jnp.where(visible[:, None], score.astype(jnp.float32), -1e9)
-        out = jax.nn.softmax(score).astype(self.dtype) @ split(value)
+        weights = jax.nn.softmax(score)
+        self.sow("intermediates", "attention", weights)  # (R, heads, Lq, Lk), kept for who asks, to be drawn
+        out = weights.astype(self.dtype) @ split(value)
         return out.transpose(0, 2, 1, 3).reshape(-1, self.width)
 
     def _mlp(self, x: jax.Array, deterministic: bool) -> jax.Array:

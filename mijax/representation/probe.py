@@ -61,6 +61,11 @@ class Decoding:
         return max(self.linear, self.mlp)
 
     @property
+    def informed(self) -> float:
+        """The way from chance to certainty, in [0, 1]."""
+        return max(0.0, (self.best - self.chance) / (1 - self.chance)) if self.chance < 1 else 0.0
+
+    @property
     def is_present(self) -> bool:
         """Whether either probe decodes the variable."""
         return self.best >= DECODED
@@ -70,7 +75,7 @@ class Decoding:
         """Whether neither probe finds a trace of it."""
         if self.measure == "R2":
             return self.best <= LEAK_R2
-        return self.best <= self.chance + LEAK_ACCURACY * (1 - self.chance)
+        return self.informed <= LEAK_ACCURACY
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +93,16 @@ class ProbeReport:
     """What an episode can earn with weight 1 by learning all, by form of the intrinsic reward."""
     p1_failures: tuple[str, ...]
     p2_failures: tuple[str, ...]
+
+    @property
+    def hidden(self) -> float:
+        """How well z_s holds what is hidden, in [0, 1]: of the variable it holds worst."""
+        return min((d.informed for d in self.decodings if d.hidden and d.source == "z_s"), default=0.0)
+
+    @property
+    def leak(self) -> float:
+        """How well z_s gives away what can be seen anyway, in [0, 1]: of the variable it gives away best."""
+        return max((d.informed for d in self.decodings if not d.hidden and d.source == "z_s"), default=0.0)
 
     @property
     def p1(self) -> bool:
@@ -118,12 +133,23 @@ def probe(
         history: what training left, for the errors of the dynamics model; None leaves them out.
     """
     data_key, mlp_key = jax.random.split(key)
-    data = collect(env, data_key, config.heldout_episodes)
-    networks = networks_for(env, representation.z_s_mean.shape[-1])
-    all_z_s = encode_frames(networks.phi, representation.phi, data.states)
-    all_z_o = encode_frames(networks.psi, representation.psi, data.observations)
+    return probe_on(collect(env, data_key, config.heldout_episodes), representation, env, mlp_key, history)
+
+
+def probe_on(
+    data: Transitions, representation: Representation, env: Environment, key: jax.Array, history: History | None = None,
+    networks: bool = True
+) -> ProbeReport:
+    """`probe` on transitions that were collected elsewhere; `key` draws the weights of the small networks.
+
+    Without `networks` there are linear probes alone: quick, for a first look.
+    """
+    encoders = networks_for(env, representation.z_s_mean.shape[-1])
+    all_z_s = encode_frames(encoders.phi, representation.phi, data.states)
+    all_z_o = encode_frames(encoders.psi, representation.psi, data.observations)
     z_s, z_o = all_z_s[data.state], all_z_o[data.observation]
-    decodings = _decodings(env.variables, data, np.asarray(z_s), np.asarray(z_o), mlp_key)
+    decodings = _decodings(env.variables, data, np.asarray(z_s), np.asarray(z_o),
+                            key if networks else None)
     errors = {} if history is None else _errors(
         env, history, data, z_s, z_o, all_z_s[data.next_state], all_z_o[data.next_observation])
     geometry, bonus = _geometry(env.variables, np.asarray(data.ground_truth), np.asarray(z_s, np.float64),
@@ -133,7 +159,8 @@ def probe(
 
 
 def _decodings(
-    variables: tuple[Variable, ...], data: Transitions, z_s: np.ndarray, z_o: np.ndarray, key: jax.Array
+    variables: tuple[Variable, ...], data: Transitions, z_s: np.ndarray, z_o: np.ndarray,
+    key: jax.Array | None
 ) -> tuple[Decoding, ...]:
     """Each variable from each source; of hidden ones, z_o counts only where it does not show them."""
     everywhere, unknown = np.ones(data.size, bool), ~np.asarray(data.reveals)
@@ -147,22 +174,26 @@ def _decodings(
     for number, (source, z, rows, wanted) in enumerate(jobs):
         if wanted:
             result += _decode(source, z[rows], truth[rows], episode[rows] % 2 == 0, [variables[i] for i in wanted],
-                              wanted, jax.random.fold_in(key, number))
+                              wanted, None if key is None else jax.random.fold_in(key, number))
     return tuple(sorted(result, key=lambda d: ([v.name for v in variables].index(d.variable), d.source)))
 
 
 def _decode(
     source: str, z: np.ndarray, truth: np.ndarray, fitted: np.ndarray, variables: list[Variable],
-    columns: tuple[int, ...], key: jax.Array
+    columns: tuple[int, ...], key: jax.Array | None
 ) -> list[Decoding]:
-    """Linear and MLP probes of some variables from (N, F) features: fitted where (N,) `fitted`, scored elsewhere."""
+    """Linear and MLP probes of some variables from (N, F) features: fitted where (N,) `fitted`, scored elsewhere.
+
+    Without a key the linear probe stands for both.
+    """
     x = whiten(z, fitted)
     parts = [np.eye(v.num_values)[truth[:, i].astype(int)] if v.num_values else truth[:, i : i + 1]
              for v, i in zip(variables, columns, strict=True)]
     y = np.concatenate(parts, axis=1)
     center, scale = y[fitted].mean(0), y[fitted].std(0)
     y = (y - center) / np.where(scale > 0, scale, 1.0)
-    guesses = {"linear": _fit_linear(x, y, fitted), "mlp": _fit_mlp(x, y, fitted, key)}
+    linear = _fit_linear(x, y, fitted)
+    guesses = {"linear": linear, "mlp": linear if key is None else _fit_mlp(x, y, fitted, key)}
     guesses = {name: guess * scale + center for name, guess in guesses.items()}
     bounds = np.cumsum([0, *(p.shape[1] for p in parts)])
     result = []

@@ -41,6 +41,30 @@ class DivergenceError(RuntimeError):
     """A loss became infinite or not a number; the message names it."""
 
 
+Weight = jax.Array | float
+
+
+@struct.dataclass
+class LossWeights:
+    """The weights of Algorithm 1, line 8, and phi's pull: one compiled program can train with different ones.
+
+    Named as in `Stage1Config`. Numbers that are compiled in, () float32 arguments of a program, or (M,) of M members.
+    """
+
+    lambda_r: Weight
+    lambda_s: Weight
+    lambda_o: Weight
+    lambda_club: Weight
+    lambda_dim_s: Weight
+    lambda_dim_o: Weight
+    phi_shrinkage: Weight
+
+    @classmethod
+    def of(cls, config: Stage1Config) -> "LossWeights":
+        """Those of a configuration, as numbers."""
+        return cls(**{f.name: getattr(config, f.name) for f in dataclasses.fields(cls)})
+
+
 @struct.dataclass
 class EstimatorState:
     """CLUB's q(z_o | z_s)."""
@@ -106,7 +130,10 @@ class History:
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A data set, the networks and the options: all that stays fixed in training."""
+    """A data set, the networks and the options: all that stays fixed in training.
+
+    Of the loss weights, `config` has Believer's and tells which losses take part; `LossWeights` has the values.
+    """
 
     networks: Networks
     config: Stage1Config
@@ -119,7 +146,10 @@ class Problem:
 
     @classmethod
     def of(cls, env: Environment, config: Stage1Config, data: Transitions) -> "Problem":
-        """Everything about `data` that can be worked out before training."""
+        """Everything about `data` that can be worked out before training; `ConfigError` if it fills no batch."""
+        if data.size < config.batch_size:
+            raise ConfigError(f"--stage1.batch-size: got {config.batch_size}, accepted: at most the {data.size} "
+                              f"transitions of --stage1.episodes {config.episodes}")
 
         def prepared(encoder: Encoder, frames: jax.Array) -> Frames:
             patches = take_apart(np.asarray(frames), encoder.layers, min(config.batch_size, frames.shape[0]))
@@ -162,18 +192,20 @@ class Problem:
         return table, weight, 0.5 * drawn / extra + 0.5 * common / jnp.maximum(jnp.sum(common), 1 / size)
 
 
-def optimizers(config: Stage1Config, updates: int) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+def optimizers(
+    config: Stage1Config, updates: int, phi_shrinkage: Weight
+) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     """Adam for the encoders and the dynamics model, its step size falling to 0 as a half cosine, with the shrinkage of
     phi; and Adam at a constant step size for the estimator, which has to follow to the end.
     """
     step_size = optax.cosine_decay_schedule(config.learning_rate, updates)
     plain = optax.adam(step_size)
     names = {name: "phi" if name == "phi" else "others" for name in ENCODER_NETWORKS}
-    shrinking = optax.chain(plain, shrink(config.phi_shrinkage, step_size))
+    shrinking = optax.chain(plain, shrink(phi_shrinkage, step_size))
     return optax.partition({"phi": shrinking, "others": plain}, names), optax.adam(config.learning_rate)
 
 
-def shrink(strength: float, step_size: optax.Schedule) -> optax.GradientTransformation:
+def shrink(strength: Weight, step_size: optax.Schedule) -> optax.GradientTransformation:
     """Pull every weight (not the biases) towards 0 by `strength` x step size after each update, and stop it there.
 
     The proximal step of an L1 penalty, decoupled from Adam's normalisation as weight decay is in AdamW: a weight
@@ -262,7 +294,7 @@ def dim_loss(z: jax.Array, local: jax.Array, index: jax.Array, weight: jax.Array
 
 
 def encoder_loss(
-    parameters: dict[str, Params], fit: EstimatorState, problem: Problem, batch: Batch,
+    parameters: dict[str, Params], fit: EstimatorState, problem: Problem, weights: LossWeights, batch: Batch,
     optimizer: optax.GradientTransformation
 ) -> tuple[jax.Array, tuple[EstimatorState, Metrics]]:
     """The weighted sum of Algorithm 1, line 8, with CLUB's estimator first fitted to the current features.
@@ -270,7 +302,7 @@ def encoder_loss(
     Returns:
         The loss, and the estimator with the terms of the loss.
     """
-    config, networks, rows, weight = problem.config, problem.networks, batch.rows, batch.weight
+    networks, rows, weight = problem.networks, batch.rows, batch.weight
     f = features(problem, parameters, rows)
     mean_z_s = f.z_s
     if batch.noise is not None:
@@ -280,17 +312,17 @@ def encoder_loss(
         networks.dynamics, parameters["dynamics"], f.z_s, f.z_o, networks.encode_action(rows.action))
     mean, log_variance = evaluate(networks.estimator, fit.parameters, standardize(f.z_s, weight))
     terms = {
-        "reward_loss": (config.lambda_r, reward_loss(reward, rows.reward, batch.reward_weight)[0]),
-        "z_s_loss": (config.lambda_s, next_feature_loss(predicted_z_s, f.next_z_s, rows.terminal, weight)[0]),
-        "z_o_loss": (config.lambda_o, next_feature_loss(predicted_z_o, f.next_z_o, rows.terminal, weight)[0]),
-        "club": (config.lambda_club, club_all_pairs(standardize(f.z_o, weight), mean, log_variance, weight)[0]),
+        "reward_loss": (weights.lambda_r, reward_loss(reward, rows.reward, batch.reward_weight)[0]),
+        "z_s_loss": (weights.lambda_s, next_feature_loss(predicted_z_s, f.next_z_s, rows.terminal, weight)[0]),
+        "z_o_loss": (weights.lambda_o, next_feature_loss(predicted_z_o, f.next_z_o, rows.terminal, weight)[0]),
+        "club": (weights.lambda_club, club_all_pairs(standardize(f.z_o, weight), mean, log_variance, weight)[0]),
     }
     if batch.noise is not None:
-        terms["kl"] = config.lambda_kl, weight @ kl_standard_normal(mean_z_s, jnp.zeros_like(mean_z_s))
+        terms["kl"] = problem.config.lambda_kl, weight @ kl_standard_normal(mean_z_s, jnp.zeros_like(mean_z_s))
     if f.local_s is not None:
-        terms["dim_s_loss"] = config.lambda_dim_s, dim_loss(f.z_s, f.local_s, rows.state, weight)
+        terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, rows.state, weight)
     if f.local_o is not None:
-        terms["dim_o_loss"] = config.lambda_dim_o, dim_loss(f.z_o, f.local_o, rows.observation, weight)
+        terms["dim_o_loss"] = weights.lambda_dim_o, dim_loss(f.z_o, f.local_o, rows.observation, weight)
     total = sum((scale * value for scale, value in terms.values()), jnp.zeros((), jnp.float32))
     return total, (fit, {"loss": total} | {name: value for name, (_, value) in terms.items()})
 
@@ -317,26 +349,30 @@ def initial_state(problem: Problem, key: jax.Array) -> TrainState:
     """Fresh parameters and optimisers."""
     parameters = init_parameters(problem.networks, key, problem.data.states[:1], problem.data.observations[:1])
     estimator = parameters.pop("estimator")
-    optimizer, estimator_optimizer = optimizers(problem.config, 1)
+    optimizer, estimator_optimizer = optimizers(problem.config, 1, 0.0)
     return TrainState(
         parameters, optimizer.init(parameters), EstimatorState(estimator, estimator_optimizer.init(estimator)))
 
 
-def make_epoch(problem: Problem) -> Callable[[TrainState, jax.Array], tuple[TrainState, Metrics]]:
-    """One pass over the data in a random order, compiled: (state, key) -> (state, metrics of the last batch)."""
+Epoch = Callable[[LossWeights, TrainState, jax.Array], tuple[TrainState, Metrics]]
+"""One pass over the data in a random order: (weights, state, key) -> (state, metrics of the last batch)."""
+
+
+def make_epoch(problem: Problem) -> Epoch:
+    """The pass over a data set, to be compiled; the loss weights are arguments, so that it compiles once for all."""
     config = problem.config
     updates = problem.updates_per_epoch
-    optimizer, estimator_optimizer = optimizers(config, config.epochs * updates)
 
-    def update(state: TrainState, draw: tuple[jax.Array, jax.Array]) -> tuple[TrainState, Metrics]:
-        gradients, (fit, metrics) = jax.grad(encoder_loss, has_aux=True)(
-            state.parameters, state.estimator, problem, problem.batch(*draw), estimator_optimizer)
-        step, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
-        parameters = cast(dict[str, Params], optax.apply_updates(state.parameters, step))
-        return TrainState(parameters, optimizer_state, fit), metrics
+    def epoch(weights: LossWeights, state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+        optimizer, estimator_optimizer = optimizers(config, config.epochs * updates, weights.phi_shrinkage)
 
-    @jax.jit
-    def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+        def update(state: TrainState, draw: tuple[jax.Array, jax.Array]) -> tuple[TrainState, Metrics]:
+            gradients, (fit, metrics) = jax.grad(encoder_loss, has_aux=True)(
+                state.parameters, state.estimator, problem, weights, problem.batch(*draw), estimator_optimizer)
+            step, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
+            parameters = cast(dict[str, Params], optax.apply_updates(state.parameters, step))
+            return TrainState(parameters, optimizer_state, fit), metrics
+
         order = jax.random.permutation(key, problem.data.size)[: updates * config.batch_size]
         draws = order.reshape(updates, config.batch_size), jax.random.split(jax.random.fold_in(key, 1), updates)
         state, metrics = jax.lax.scan(update, state, draws)
@@ -365,11 +401,10 @@ def train_on(
     on_progress: ProgressCallback | None = None
 ) -> tuple[Representation, History]:
     """Stage 1 on transitions that were collected elsewhere (demonstrations); see `learn_representation`."""
-    if data.size < config.batch_size:
-        raise ConfigError(f"--stage1.batch-size: got {config.batch_size}, accepted: at most the {data.size} "
-                          f"transitions of --stage1.episodes {config.episodes}")
     problem = Problem.of(env, config, data)
-    state, epoch = initial_state(problem, init_key), make_epoch(problem)
+    state = initial_state(problem, init_key)
+    # Weights are compiled in: as arguments they would round differently, and every known result would move a little.
+    epoch = jax.jit(functools.partial(make_epoch(problem), LossWeights.of(config)))
     seen: list[dict[str, float]] = []
     started = compiled = time.perf_counter()
     for number in range(1, config.epochs + 1):
@@ -384,7 +419,7 @@ def train_on(
         dynamics=state.parameters["dynamics"], estimator=state.estimator.parameters,
         updates=config.epochs * problem.updates_per_epoch,
         compile_seconds=compiled - started, seconds=time.perf_counter() - compiled)
-    return _representation(problem, state), history
+    return representation_of(problem, state), history
 
 
 def _refuse_divergence(metrics: dict[str, float], epoch: int, config: Stage1Config) -> None:
@@ -394,7 +429,7 @@ def _refuse_divergence(metrics: dict[str, float], epoch: int, config: Stage1Conf
                               f"try a smaller --stage1.learning-rate than {config.learning_rate}")
 
 
-def _representation(problem: Problem, state: TrainState) -> Representation:
+def representation_of(problem: Problem, state: TrainState) -> Representation:
     """The encoders, with the moments of z_s over all transitions."""
     data = problem.data
     phi = state.parameters["phi"]

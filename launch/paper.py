@@ -1,0 +1,298 @@
+"""The paper's experiments, one command each.
+
+    python -m launch.paper fig3 --domain heaven_hell --seeds 5
+    python -m launch.paper all
+
+Every run is kept under OUT/runs and never made twice: a command that was stopped goes on where it was when it is given
+again, more seeds are added to those that are there, and experiments share their runs. Each writes its figure and a
+table with the probability of improvement over each baseline into OUT, and says on the figure where it used fewer seeds
+or steps than the paper.
+
+    OUT/runs/DOMAIN/features-NAME                stage 1, shared by all runs that act on these features
+    OUT/runs/DOMAIN/ARM-STEPS/seeds_K..          a run of `mijax.train`
+    OUT/FIGURE.png, OUT/FIGURE.md, OUT/FIGURE.csv
+"""
+
+import argparse
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+
+from envs_mjx import registry
+from launch.experiments import EXPERIMENTS, GRID_WORLDS, Arm
+from mijax import episode, evaluate, figures, runtime, stage1, tables, train
+from mijax.config import ConfigError, config_from_dict, parse_seeds, require
+from mijax.learner import make_learner
+from mijax.metrics import RunError, RunFolder
+from mijax.representation.dataset import collect
+from mijax.representation.storage import FACTS_FILE
+from mijax.results import ReportedRun, summarise
+from mijax.seeds import evaluation_key
+
+PAPER_SEEDS = 5
+PAPER_STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000}
+"""Environment steps of the paper's runs: 10 000, 10 000 and 20 000 episodes of 50 steps."""
+TRACED_EPISODES = 100
+"""Episodes of each seed behind the numbers of Fig. 32."""
+SAY: Callable[[str], None] = print
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What was asked for."""
+
+    out: pathlib.Path
+    domain: str | None
+    seeds: tuple[int, ...]
+    steps: int | None
+    extra: tuple[str, ...]
+    """Further options of `mijax.train`, for all runs."""
+
+    def parse(self, domain: str, arm: Arm) -> train.TrainOptions:
+        """The options of an arm's training, without its folder and seeds."""
+        steps = () if self.steps is None else ("--steps", str(self.steps))
+        return train.parse(("--domain", domain, *arm.options, *steps, *self.extra))
+
+
+class Stopped(Exception):
+    """Ctrl-C: what is there is whole, the same command goes on."""
+
+
+# ----------------------------------------------------------------------------------------------------------------- runs
+
+
+def run_arm(request: Request, domain: str, arm: Arm) -> list[RunFolder]:
+    """The finished runs that hold an arm's seeds: those that are there, resumed ones, and one of all missing seeds."""
+    options = request.parse(domain, arm)
+    place = folder_of(request, domain, arm, options)
+    runs = [RunFolder.open(path) for path in sorted(place.glob("seeds_*")) if (path / "config.json").exists()]
+    runs = [run for run in runs if set(run.config()["seed_list"]) & set(request.seeds)]
+    for run in runs:
+        check_same(run, options)
+        if run.summary() is None:
+            finish(train.parse(("--resume", str(run.path))))
+    missing = [seed for seed in request.seeds if not any(seed in run.config()["seed_list"] for run in runs)]
+    if missing:
+        source = None if arm.features is None else shared_features(request, domain, arm, options)
+        runs.append(finish(dataclasses.replace(
+            options, seeds=",".join(map(str, missing)) + ",", representation=source,
+            out=place / f"seeds_{'_'.join(map(str, missing))}")))
+    return runs
+
+
+def folder_of(request: Request, domain: str, arm: Arm, options: train.TrainOptions) -> pathlib.Path:
+    """Where an arm's runs of this many steps are."""
+    return request.out / "runs" / domain.replace(":", ".") / f"{arm.name}-{options.config.steps}"
+
+
+def finish(options: train.TrainOptions) -> RunFolder:
+    """Train to the end."""
+    run = train.train(options, SAY)
+    if run.summary() is None:
+        raise Stopped(f"stopped in {run.path}; the same command goes on from there")
+    return run
+
+
+def check_same(run: RunFolder, options: train.TrainOptions) -> None:
+    """Raise `RunError` if a run was made with other options than it would be now."""
+    stored = {name: value for name, value in run.config().items() if name not in ("seed_list", "track")}
+    there, wanted = (_flat(dataclasses.asdict(config)) for config in (config_from_dict(stored), options.config))
+    free = ("memory", "seeds.strategy")  # resolved from `auto` when stored; changes no numbers
+    other = [name for name, value in wanted.items() if there[name] != value and name not in free]
+    if other:
+        raise RunError(f"{run.path}: was made with --{other[0].replace('_', '-')} {there[other[0]]}, wanted "
+                       f"{wanted[other[0]]}; choose another --out")
+
+
+def _flat(values: dict, prefix: str = "") -> dict:
+    flat = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def shared_features(request: Request, domain: str, arm: Arm, options: train.TrainOptions) -> pathlib.Path:
+    """The run of stage 1 that an arm takes its features from, with every seed that was asked for."""
+    config, path = options.config, request.out / "runs" / domain.replace(":", ".") / f"features-{arm.features}"
+    if (path / "config.json").exists():
+        run = RunFolder.open(path)
+        if run.config()["stage1"] != dataclasses.asdict(config.stage1):
+            raise RunError(f"{path}: was made with other --stage1 options; choose another --out")
+    else:
+        run = RunFolder.create(path, {"domain": domain, "stage1": dataclasses.asdict(config.stage1)})
+    env = registry.make(domain)
+    for seed in request.seeds:
+        if not (stage1.folder_of(run, seed) / FACTS_FILE).exists():
+            stage1.learn(run, env, config.stage1, seed, SAY)
+    return path
+
+
+def merged(arm: Arm, runs: Sequence[RunFolder], seeds: Sequence[int]) -> ReportedRun:
+    """Runs that hold different seeds of one arm, as one."""
+    summaries = [run.summary() or summarise(run) for run in runs]
+    every = {seed: value for summary in summaries for seed, value in summary["seeds"].items()}
+    metrics = {seed: run.metrics(seed) for run in runs for seed in run.seeds() if seed in seeds}
+    summary = summaries[0] | {"seeds": {str(seed): every[str(seed)] for seed in sorted(metrics)}}
+    return ReportedRun(arm.label, arm.colour, summary, dict(sorted(metrics.items())))
+
+
+# -------------------------------------------------------------------------------------------------------------- figures
+
+
+def note_on(request: Request, domains: Sequence[str], steps: dict[str, int]) -> str:
+    """What a figure says of budgets: its own, and the paper's where that is larger."""
+    parts = []
+    for domain in domains:
+        own, paper = steps[domain], PAPER_STEPS.get(domain, 0)
+        shrunk = own < paper or len(request.seeds) < PAPER_SEEDS
+        parts.append(f"{figures.display_name(domain)}: {len(request.seeds)} seed{'s' * (len(request.seeds) > 1)}, "
+                     f"{own:,} steps" + (f" (paper: {PAPER_SEEDS} seeds, {paper:,} steps)" if shrunk and paper else ""))
+    return "; ".join(parts)
+
+
+def stage1_samples(request: Request, domain: str, arm: Arm) -> int:
+    """Environment steps of the random policy that an arm's features were trained on."""
+    if arm.features is None and "believer" not in arm.options:
+        return 0
+    config = request.parse(domain, arm).config
+    key = jax.random.split(stage1.representation_key(request.seeds[0]), 3)[0]
+    return collect(registry.make(domain), key, config.stage1.episodes).size
+
+
+def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
+    """Train what is missing of an experiment, domain by domain, and write its figure and table after each."""
+    experiment = EXPERIMENTS[name]
+    groups: dict[str, list[ReportedRun]] = {}
+    starts: dict[str, dict[str, int]] = {}
+    steps: dict[str, int] = {}
+    for number, domain in enumerate(domains, start=1):
+        for title, arms in experiment.groups(domain).items():
+            groups[title] = [merged(arm, run_arm(request, domain, arm), request.seeds) for arm in arms]
+            starts[title] = {arm.label: stage1_samples(request, domain, arm) for arm in arms}
+            steps[domain] = request.parse(domain, arms[0]).config.steps
+        note = note_on(request, domains[:number], steps)
+        if any(start for group in starts.values() for start in group.values()):
+            note += ". Dashed vertical: stage 1's random steps end, task learning starts"
+        figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note, starts=starts)
+        write_table(name, request, experiment.title, groups, note)
+
+
+def write_table(name: str, request: Request, title: str, groups: dict[str, list[ReportedRun]], note: str) -> None:
+    """OUT/NAME.md and OUT/NAME.csv."""
+    lines = [{"panel": panel, **line} for panel, runs in groups.items() for line in tables.comparison_table(runs)]
+    tables.write_csv(request.out / f"{name}.csv", lines)
+    text = (f"# {title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
+            + "\n\n".join(f"## {panel}\n\n{tables.comparison_markdown(runs)}" for panel, runs in groups.items()) + "\n")
+    (request.out / f"{name}.md").write_text(text, encoding="utf-8")
+    SAY(text)
+
+
+def command_line(name: str, request: Request) -> str:
+    """What makes this result again."""
+    parts = [f"python -m launch.paper {name}", *([] if request.domain is None else [f"--domain {request.domain}"])]
+    parts += [f"--seeds {','.join(map(str, request.seeds))},"]
+    parts += [] if request.steps is None else [f"--steps {request.steps}"]
+    return " ".join([*parts, *request.extra])
+
+
+def run_intrinsic(name: str, request: Request, domains: Sequence[str]) -> None:
+    """Fig. 32: the intrinsic reward of one episode in each domain, and how often it peaks at the information."""
+    lines, drawn, steps = [], [], {}
+    for domain in domains:
+        (arm,), = EXPERIMENTS[name].groups(domain).values()
+        runs = run_arm(request, domain, arm)
+        for run in runs:
+            config = evaluate.config_of(run)
+            learner, steps[domain] = make_learner(registry.make(domain), config), config.steps
+            for seed in (seed for seed in run.seeds() if seed in request.seeds):
+                step, state = evaluate.load_learner_state(run, seed, learner)
+                seen = episode.trace(learner, state, evaluation_key(seed, step), TRACED_EPISODES)
+                ends = seen.reward[np.arange(TRACED_EPISODES), seen.length]
+                lines.append({
+                    "domain": domain, "seed": seed, "episodes": TRACED_EPISODES, "success": float(np.mean(ends > 0)),
+                    "informed": float(np.mean(seen.first_information() >= 0)),
+                    "peaks_at_information": seen.peaks_at_information()})
+                if domain not in [name for name, *_ in drawn]:
+                    informed = np.flatnonzero(seen.first_information() >= 0)
+                    index = int(informed[0]) if len(informed) else 0
+                    drawn.append((domain, config.information.intrinsic_weight, seen, index))
+                    episode.draw_episode(
+                        seen, index, learner.env, request.out / f"{name}_{domain.replace(':', '.')}.png",
+                        weight=config.information.intrinsic_weight,
+                        title=f"{figures.display_name(domain)}, seed {seed}, step {step:,}")
+        note = note_on(request, list(steps), steps)
+        episode.draw_bonuses([(figures.display_name(d), *rest) for d, *rest in drawn], request.out / f"{name}.png",
+                             title=EXPERIMENTS[name].title, note=note)
+        tables.write_csv(request.out / f"{name}.csv", lines)
+        text = (f"# {EXPERIMENTS[name].title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
+                f"{tables.plain_markdown(lines)}\n\nPeaks at information: of the episodes that were told the hidden "
+                "variable, the share whose intrinsic reward peaks at the step that first tells it.\n")
+        (request.out / f"{name}.md").write_text(text, encoding="utf-8")
+        SAY(text)
+
+
+# -------------------------------------------------------------------------------------------------------------- command
+
+
+def plan(what: str, domain: str | None) -> list[tuple[str, tuple[str, ...]]]:
+    """The experiments to run, in order, each with its domains. `all` goes through the domains one after the other, so
+    that the cheap ones are complete first."""
+    names = list(EXPERIMENTS) if what == "all" else [what]
+    if domain is not None:
+        chosen = [(name, (domain,)) for name in names]
+        return [(name, d) for name, d in chosen if what != "all" or domain in EXPERIMENTS[name].domains]
+    if what != "all":
+        return [(what, EXPERIMENTS[what].domains)]
+    return [(name, tuple(d for d in GRID_WORLDS[:number] if d in EXPERIMENTS[name].domains))
+            for number in range(1, len(GRID_WORLDS) + 1) for name in names
+            if GRID_WORLDS[number - 1] in EXPERIMENTS[name].domains]
+
+
+def parse(arguments: Sequence[str]) -> tuple[str, Request]:
+    """The command line; what it does not know is passed on to `mijax.train`."""
+    parser = argparse.ArgumentParser(
+        prog="python -m launch.paper", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False)
+    parser.add_argument("experiment", metavar="|".join((*EXPERIMENTS, "all")))
+    parser.add_argument("--domain", help="one domain; default: those of the paper's figure")
+    parser.add_argument("--seeds", default=str(PAPER_SEEDS), help="how many (5), or which ones (3,7; a single one: 3,)")
+    parser.add_argument("--steps", type=int, help="environment steps of each run; default: the domain's preset")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/paper"), help="where to write")
+    known, extra = parser.parse_known_args(list(arguments))
+    accepted = ", ".join((*EXPERIMENTS, "all"))
+    if known.experiment not in (*EXPERIMENTS, "all"):
+        raise ConfigError(f"experiment: got {known.experiment!r}, accepted: {accepted}")
+    require(known.steps is None or known.steps >= 1, "steps", known.steps, "a number >= 1")
+    reserved = [word for word in extra if word.split("=")[0] in ("--agent", "--memory", "--resume", "--representation")]
+    require(not reserved, (reserved[0] if reserved else "").lstrip("-"), "a value",
+            "nothing here, the experiment sets it")
+    if known.domain is not None:
+        registry.make(known.domain)
+    seeds = parse_seeds(known.seeds)
+    return known.experiment, Request(known.out, known.domain, seeds, known.steps, tuple(extra))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    try:
+        what, request = parse(sys.argv[1:] if arguments is None else arguments)
+        runtime.prepare(host_devices=min(runtime.cores(), len(request.seeds)))
+        request.out.mkdir(parents=True, exist_ok=True)
+        for name, domains in plan(what, request.domain):
+            SAY(f"== {name}: {EXPERIMENTS[name].title}: {', '.join(domains)}")
+            (run_intrinsic if name == "fig32" else run_curves)(name, request, domains)
+    except (*train.USER_ERRORS, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except Stopped as stopped:
+        print(stopped)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

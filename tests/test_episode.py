@@ -1,0 +1,127 @@
+"""Greedy episodes seen from inside, and their figure."""
+
+import dataclasses
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from envs_mjx import registry
+from mijax import report
+from mijax.checkpoint import Checkpoints
+from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig, Stage1Config
+from mijax.episode import Trace, trace
+from mijax.learner import Learner, LearnerState, make_learner
+from mijax.metrics import RunFolder
+from mijax.representation import learn_representation
+from mijax.representation.storage import save_representation
+from mijax.seeds import training_key
+from mijax.stage1 import folder_of
+
+STAGE1 = Stage1Config(episodes=20, epochs=1, batch_size=200, features=4)
+CONFIG = Config(
+    stage1=STAGE1, steps=1000,
+    network=NetworkConfig(action_embedding=4, observation_embedding=4, gru_width=8, critic_hidden=(16,),
+                          auxiliary_hidden=(8,)),
+    dqn=DQNConfig(batch_episodes=4, warmup_episodes=4, replay_steps=400), evaluation=EvaluationConfig(every=20),
+)
+pytestmark = pytest.mark.lenient
+
+
+@pytest.fixture(scope="module")
+def ours() -> tuple[Learner, LearnerState]:
+    """An untrained `mi` with a transformer."""
+    learner = make_learner(registry.make("heaven_hell"), CONFIG)
+    representation, _ = learn_representation(learner.env, STAGE1, jax.random.key(0))
+    return learner, jax.jit(learner.init)(training_key(0), representation)
+
+
+@pytest.fixture(scope="module")
+def seen(ours: tuple[Learner, LearnerState]) -> Trace:
+    return trace(*ours, jax.random.key(3), 5)
+
+
+def test_whole_episodes_show_the_values_that_acting_followed(seen: Trace) -> None:
+    steps = np.arange(51) < seen.length[:, None]
+    np.testing.assert_array_equal(seen.q.argmax(-1)[steps], seen.action[steps])
+    world = registry.make("heaven_hell")
+    ended = world.tables.terminal[seen.env_state.cell, seen.env_state.goal]  # pyright: ignore
+    for row, length in enumerate(seen.length):
+        assert ended[row, length] or length == 50
+        assert not ended[row, :length].any()
+
+
+def test_the_bonus_is_what_explaining_more_pays(seen: Trace) -> None:
+    assert seen.bonus is not None
+    assert seen.explained is not None
+    assert seen.explained_by_agent is not None
+    assert seen.explained.shape == seen.explained_by_agent.shape == seen.bonus.shape == (5, 51)
+    assert (seen.bonus[:, 0] == 0).all()
+    # where the state does not change, neither does z_s, and the bonus is the step in what is explained
+    cell = seen.env_state.cell
+    stays = (cell[:, 1:] == cell[:, :-1]) & (np.arange(1, 51) <= seen.length[:, None])
+    assert stays.any()
+    np.testing.assert_allclose(seen.bonus[:, 1:][stays], np.diff(seen.explained, axis=1)[stays], atol=1e-4)
+
+
+def test_attention_is_causal_and_sums_to_one(seen: Trace) -> None:
+    assert seen.attention is not None
+    assert seen.attention.shape == (5, 2, 51, 51)
+    for row, length in enumerate(seen.length):
+        own = seen.attention[row, :, : length + 1]
+        np.testing.assert_allclose(own.sum(-1), 1, atol=1e-5)
+        assert np.triu(own[..., : length + 1], 1).max() == 0
+
+
+def test_peaks_are_compared_with_the_first_information(seen: Trace) -> None:
+    bonus, reveals = np.zeros((3, 51)), np.zeros((3, 51), bool)
+    bonus[0, [4, 9]], reveals[0, [4, 5]] = (0.8, 0.2), True  # peaks when it is first told
+    bonus[1, [4, 9, 40]], reveals[1, 9] = (0.8, 0.2, 5.0), True  # peaks before; 40 is beyond its end
+    bonus[2, 3] = 0.5  # is never told
+    made = dataclasses.replace(seen, bonus=bonus, reveals=reveals, length=np.array([12, 12, 12]))
+    assert made.peaks().tolist() == [4, 4, 3]
+    assert made.first_information().tolist() == [4, 9, -1]
+    assert made.peaks_at_information() == 0.5
+    assert np.isnan(dataclasses.replace(made, reveals=reveals & False).peaks_at_information())
+
+
+@pytest.mark.parametrize(("agent", "memory"), [("mi", "gpt"), ("base", "gru")])
+def test_the_command_draws_an_episode_of_each_kind(
+    ours: tuple[Learner, LearnerState], tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], agent: str,
+    memory: str
+) -> None:
+    learner, state = ours
+    config = dataclasses.replace(CONFIG, agent=agent, memory=memory)
+    run = RunFolder.create(tmp_path / "run", dataclasses.asdict(config) | {"seed_list": [2], "track": "none"})
+    if agent == "base":
+        learner = make_learner(learner.env, config)
+        state = jax.jit(learner.init)(training_key(2), None)
+    else:
+        assert state.representation is not None
+        save_representation(state.representation, learner.env, folder_of(run, 2))
+    checkpoints = Checkpoints(run, 2)
+    checkpoints.save(200, state)
+    checkpoints.close()
+    assert report.main([str(run.path), "--episode"]) == 0
+    figure = run.path / "episode_seed_2.png"
+    assert str(figure) in capsys.readouterr().out
+    image = Image.open(figure).convert("RGB")
+    colours = {colour for count, colour in image.getcolors(image.width * image.height) or [] if count > 30}
+    assert ((214, 39, 40) in colours) is (agent == "mi")  # the red ring
+    assert (96, 186, 110) in colours  # the goal's cell
+
+
+def test_what_cannot_be_drawn_is_named(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = RunFolder.create(tmp_path / "run", dataclasses.asdict(CONFIG) | {"seed_list": [0], "track": "none"})
+    run.seed_path(0).mkdir()
+    for arguments, message in (
+        ([str(run.path), "--seed", "4"], "--seed: got 4, accepted: 0"),
+        ([str(run.path), str(run.path)], "--episode: got 2 runs, accepted: one"),
+        ([str(run.path)], "seed 0 has no checkpoint yet"),
+    ):
+        assert report.main([*arguments, "--episode"]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1

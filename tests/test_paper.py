@@ -1,0 +1,151 @@
+"""The paper's experiments: which runs they need, that they never make one twice, and their figures and tables."""
+
+import pathlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from launch import paper
+from launch.experiments import AGENTS, EXPERIMENTS, GRID_WORLDS, ablations, memories, overlap
+from mijax import tables
+from mijax.metrics import RunFolder
+from mijax.results import ReportedRun
+
+TINY = (
+    "--network.action-embedding", "4", "--network.observation-embedding", "4", "--network.critic-hidden", "8",
+    "--network.auxiliary-hidden", "8", "--network.gru-width", "8", "--stage1.episodes", "12",
+    "--stage1.heldout-episodes", "8", "--stage1.epochs", "1", "--stage1.batch-size", "100", "--dqn.batch-episodes", "4",
+    "--dqn.replay-steps", "2000", "--dqn.warmup-episodes", "4", "--evaluation.every", "200", "--evaluation.episodes",
+    "4", "--checkpoint.every", "1", "--seeds.strategy", "map")
+pytestmark = pytest.mark.lenient
+
+
+def test_every_figure_is_planned_cheap_domains_first() -> None:
+    assert set(EXPERIMENTS) == {"fig3", "fig4", "fig5", "fig6", "fig29", "fig30", "fig31", "fig32"}
+    assert [arm.options[1] for arm in AGENTS] == ["mi", "base", "zp", "ba", "ua", "believer"]
+    assert paper.plan("fig3", None) == [("fig3", GRID_WORLDS)]
+    assert paper.plan("fig3", "sphinx") == [("fig3", ("sphinx",))]
+    everything = paper.plan("all", None)
+    assert {name for name, _ in everything} == set(EXPERIMENTS)
+    last_domains = [GRID_WORLDS.index(domains[-1]) for _, domains in everything]
+    assert last_domains == sorted(last_domains)
+    assert "fig4" not in {name for name, _ in paper.plan("all", "sphinx")}
+
+
+def test_experiments_share_their_runs() -> None:
+    (gpt, gru), = memories("sphinx").values()
+    (both, *_), = ablations("sphinx").values()
+    assert gpt.name == both.name == AGENTS[0].name
+    assert gru.options[-2:] == ("--memory", "gru")
+    (with_bonus, without, _), = ablations("carflag_2d").values()  # whose preset has no bonus
+    assert "--information.intrinsic-weight" in with_bonus.options
+    assert with_bonus.name != AGENTS[0].name
+    assert without.options[-2:] == ("--information.intrinsic-weight", "0")  # the last one counts
+    ours, believers = overlap("heaven_hell").values()
+    assert ours[2] == believers[2]  # the raw state has nothing to do with features
+    assert {arm.features for arm in believers} == {"believer", None}
+
+
+def command(out: pathlib.Path) -> list[str]:
+    """The options that all runs here share."""
+    return ["--domain", "heaven_hell", "--steps", "400", "--out", str(out), *TINY]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """Fig. 5 on Heaven-Hell, one seed, a few steps."""
+    out = tmp_path_factory.mktemp("paper")
+    assert paper.main(["fig5", "--seeds", "1", *command(out)]) == 0
+    return out
+
+
+def contents(out: pathlib.Path) -> dict[pathlib.Path, tuple[int, int]]:
+    """Size and time of every file of the runs."""
+    files = (path for path in (out / "runs").rglob("*") if path.is_file())
+    return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
+
+
+def test_an_experiment_leaves_its_figure_and_table(done: pathlib.Path) -> None:
+    text = (done / "fig5.md").read_text()
+    assert "1 seed, 400 steps (paper: 5 seeds, 500,000 steps)" in text
+    assert "P(ours better), area" in text
+    assert "--steps 400" in text
+    with Image.open(done / "fig5.png") as image:
+        assert min(image.size) > 300
+    places = {path.parent.parent.name for path in done.glob("runs/heaven_hell/*/*/summary.json")}
+    assert places == {"mi-400", "mi-gru-400"}
+    features = list((done / "runs" / "heaven_hell").rglob("representation.msgpack"))
+    assert len(features) == 3  # the shared ones, and a copy in each run
+    assert len({path.read_bytes() for path in features}) == 1
+
+
+def test_what_is_there_is_not_made_again_and_seeds_are_added(done: pathlib.Path) -> None:
+    before = contents(done)
+    assert paper.main(["fig5", "--seeds", "1", *command(done)]) == 0
+    assert contents(done) == before
+    assert paper.main(["fig32", "--seeds", "2", *command(done)]) == 0
+    after = contents(done)
+    assert before.items() <= after.items()
+    assert RunFolder.open(done / "runs/heaven_hell/mi-400/seeds_1").seeds() == (1,)
+    assert {path.name for path in done.glob("fig32*")} >= {"fig32.png", "fig32.md", "fig32_heaven_hell.png"}
+    assert "| heaven_hell | 1 " in (done / "fig32.md").read_text()
+
+
+def test_a_run_that_was_stopped_goes_on(done: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = RunFolder.open(done / "runs/heaven_hell/mi-gru-400/seeds_0")
+    summary = run.summary()
+    (run.path / "summary.json").unlink()
+    started = []
+    real = paper.train.train
+
+    def watched(options, say):
+        started.append(options.resume)
+        return real(options, say)
+
+    monkeypatch.setattr(paper.train, "train", watched)
+    assert paper.main(["fig5", "--seeds", "1", *command(done)]) == 0
+    assert started == [run.path]
+    again = run.summary()
+    assert again is not None
+    assert summary is not None
+    assert again["seeds"]["0"]["steps"] == summary["seeds"]["0"]["steps"]
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["fig7"], "experiment: got 'fig7', accepted: fig4, fig3"),
+    (["fig3", "--domain", "mars"], "unknown domain 'mars'"),
+    (["fig3", "--seeds", "x"], "--seeds: got 'x'"),
+    (["fig3", "--steps", "0"], "--steps: got 0"),
+    (["fig3", "--agent", "mi"], "--agent: got 'a value', accepted: nothing here"),
+    (["fig5", "--domain", "heaven_hell", "--seeds", "1", "--steps", "400", *TINY, "--dqn.discount", "0.5"],
+     "was made with --dqn.discount 0.97, wanted 0.5"),
+])
+def test_bad_input_is_one_line(
+    done: pathlib.Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert paper.main([*arguments, "--out", str(done)]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_the_table_compares_ours_with_each() -> None:
+    def run(label: str, solved_at: list[int | None]) -> ReportedRun:
+        metrics = {
+            seed: [{"step": step, "evaluation/success": float(at is not None and step >= at)}
+                   for step in (10, 20, 30, 40)]
+            for seed, at in enumerate(solved_at)}
+        seeds = {str(seed): {"success": float(at is not None), "steps_to_solve": at, "wall": {}}
+                 for seed, at in enumerate(solved_at)}
+        return ReportedRun(label, "#000000", {"domain": "test", "seeds": seeds}, metrics)
+
+    runs = [run("ours", [10, 20]), run("same", [10, 20]), run("worse", [None, 30])]
+    ours, same, worse = tables.comparison_table(runs)
+    assert (ours["area_mean"], ours["solved"]) == (0.875, 2)
+    assert "p_area" not in ours
+    assert (same["p_area"], same["p_steps"]) == (0.5, 0.5)
+    assert (worse["p_area"], worse["p_steps"], worse["solved"]) == (1.0, 1.0, 1)
+    np.testing.assert_allclose(worse["area_std"], np.std([0.0, 0.5], ddof=1))
+    text = tables.comparison_markdown([run("ours", [10, 20]), run("worse", [None, 30])])
+    assert "1.000 [1.000, 1.000]" in text

@@ -165,6 +165,12 @@ def test_divergence_is_one_line_that_names_the_loss(env):
 
 
 @pytest.mark.lenient
+def test_features_that_vanish_are_one_line_that_names_the_option(env):
+    with pytest.raises(DivergenceError, match=r"z_s is the same in every state.* try a smaller --stage1.phi-shrinkage"):
+        learn_representation(env, dataclasses.replace(SMALL, phi_shrinkage=1e4), jax.random.key(0))
+
+
+@pytest.mark.lenient
 def test_too_little_data_is_an_error(env):
     with pytest.raises(ConfigError, match=r"at most the \d+ transitions"):
         learn_representation(env, dataclasses.replace(SMALL, batch_size=100_000), jax.random.key(0))

@@ -41,6 +41,8 @@ class DivergenceError(RuntimeError):
     """A loss became infinite or not a number; the message names it."""
 
 
+CONSTANT = 1e-10
+"""A variance of z_s below this is the rounding of its mean."""
 Weight = jax.Array | float
 
 
@@ -419,7 +421,11 @@ def train_on(
         dynamics=state.parameters["dynamics"], estimator=state.estimator.parameters,
         updates=config.epochs * problem.updates_per_epoch,
         compile_seconds=compiled - started, seconds=time.perf_counter() - compiled)
-    return representation_of(problem, state), history
+    representation = representation_of(problem, state)
+    if representation.z_s_variance < CONSTANT:
+        raise DivergenceError(f"stage 1: z_s is the same in every state, nothing to be informed about; "
+                              f"try a smaller --stage1.phi-shrinkage than {config.phi_shrinkage}")
+    return representation, history
 
 
 def _refuse_divergence(metrics: dict[str, float], epoch: int, config: Stage1Config) -> None:

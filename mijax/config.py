@@ -5,7 +5,11 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-MemoryName = Literal["gpt", "gru"]
+MemoryKind = Literal["gpt", "gru", "mlp"]
+MemoryName = Literal["auto", "gpt", "gru", "mlp"]
+CriticInput = Literal["state", "history_state"]
+"""What an asymmetric critic sees beside the action: s, or h and s."""
+PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
 IntrinsicForm = Literal["explained_variance", "cosine"]
 SeedStrategy = Literal["auto", "map", "vmap", "shard"]
 
@@ -59,6 +63,8 @@ class Stage1Config:
     """Weight of the lower bound of I(o; z_o), which is maximised."""
     estimator_updates: int = 5
     """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
+    lambda_kl: float = 0.0
+    """Weight of Believer's penalty KL[N(phi(s), 1) || N(0, 1)]; above 0, training draws z_s from that Gaussian."""
     rewarded: int = 0
     """Rewarded transitions added to every batch, for the reward loss alone, which then weighs rewarded and unrewarded
     ones alike. For rewards so rare that a batch hardly holds one; 0 is the paper's loss."""
@@ -71,7 +77,7 @@ class Stage1Config:
         _require_at_least("stage1.", self, 1, "episodes", "heldout_episodes", "epochs", "batch_size", "features",
                           "estimator_updates")
         _require_at_least("stage1.", self, 0, "lambda_r", "lambda_s", "lambda_o", "lambda_club", "lambda_dim_s",
-                          "lambda_dim_o", "rewarded", "phi_shrinkage")
+                          "lambda_dim_o", "lambda_kl", "rewarded", "phi_shrinkage")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
 
 
@@ -173,6 +179,47 @@ class InformationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SelfPredictionConfig:
+    """ZP-DRQN alone (paper Appendix A.2)."""
+
+    weight: float = 1.0
+    """Weight of the prediction of the next history summary (Table 2)."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("zp.", self, 0, "weight")
+
+
+@dataclasses.dataclass(frozen=True)
+class BelieverConfig:
+    """B-DQN alone (paper Appendix A.5)."""
+
+    history_width: int = 16
+    """Width of the history's summary x (Table 2: X-Dim)."""
+    latent_width: int = 16
+    """Width of the latent of the history VAE (Table 2: Z-Dim)."""
+    samples: int = 16
+    """Beliefs sampled per history."""
+    updates: int = 2000
+    """Updates of the history VAE on random episodes, as many as stage 1's, before learning starts."""
+    lambda_kl: float = 0.01
+    """Weight of the KL penalty in stage 1, which takes the place of all other penalties there."""
+    weight: float = 1.0
+    """Weight of the VAE's loss, in nats, while learning: the history model is fine-tuned."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("believer.", self, 1, "history_width", "latent_width", "samples")
+        _require_at_least("believer.", self, 0, "updates", "lambda_kl", "weight")
+
+
+@dataclasses.dataclass(frozen=True)
+class MDPConfig:
+    """The overlap test's memoryless agent alone (paper Section 5.2.1)."""
+
+    sees: PrivilegedInput = "z_s_z_o"
+    """What it acts on: z_s, z_s beside z_o, or the state itself."""
+
+
+@dataclasses.dataclass(frozen=True)
 class EvaluationConfig:
     """Greedy evaluation during training."""
 
@@ -218,9 +265,9 @@ class Config:
     domain: str = "heaven_hell"
     """A registered environment, or `package.module:EnvClass`."""
     agent: str = "mi"
-    """mi (ours) or base (DTQN): see mijax.agents.variants."""
-    memory: MemoryName = "gpt"
-    """The sequence model of the memory branch."""
+    """mi (ours), base (DTQN), zp, ba, ua, believer or mdp: see mijax.agents.variants."""
+    memory: MemoryName = "auto"
+    """The sequence model of the memory branch. auto: the agent's own, for most a gpt; mlp: no memory."""
     steps: int = 100_000
     """Environment steps of stage 2."""
     num_envs: int = 4
@@ -232,6 +279,9 @@ class Config:
     dqn: DQNConfig = dataclasses.field(default_factory=DQNConfig)
     information: InformationConfig = dataclasses.field(default_factory=InformationConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    zp: SelfPredictionConfig = dataclasses.field(default_factory=SelfPredictionConfig)
+    believer: BelieverConfig = dataclasses.field(default_factory=BelieverConfig)
+    mdp: MDPConfig = dataclasses.field(default_factory=MDPConfig)
     seeds: SeedsConfig = dataclasses.field(default_factory=SeedsConfig)
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
 

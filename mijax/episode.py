@@ -87,12 +87,12 @@ def _trace(learner: Learner, state: LearnerState, key: jax.Array, num: int) -> d
     env_state, timestep, previous, action = cast(tuple[EnvState, TimeStep, jax.Array, jax.Array], whole)
     length = jnp.argmax(timestep.done, axis=1).astype(jnp.int32)
     tokens = _tokens(learner, state.representation, timestep, previous, length)
-    (q, predicted), seen = agent.network.apply({"params": state.agent.target}, tokens, mutable=["intermediates"])
+    outputs, seen = agent.network.apply({"params": state.agent.target}, tokens, mutable=["intermediates"])
     attention = jax.tree.leaves(seen)
     return {
-        "env_state": env_state, "reward": timestep.reward, "length": length, "action": action, "q": q,
+        "env_state": env_state, "reward": timestep.reward, "length": length, "action": action, "q": outputs.q,
         "reveals": jax.vmap(jax.vmap(env.reveals))(env_state), "attention": attention[-1] if attention else None,
-    } | _information(learner, state, tokens, predicted)
+    } | _information(learner, state, tokens, outputs.z_s)
 
 
 def _tokens(learner: Learner, representation: Representation | None, timestep: TimeStep, previous: jax.Array,
@@ -105,7 +105,8 @@ def _tokens(learner: Learner, representation: Representation | None, timestep: T
     return Tokens(
         frames=timestep.observation.reshape(-1, *timestep.observation.shape[2:]), frame=None, z_s=z_s,
         previous_action=previous, reward=timestep.reward, terminated=timestep.terminated,
-        truncated=timestep.truncated, segment=(position <= length[:, None]).astype(jnp.int32), position=position)
+        truncated=timestep.truncated, segment=(position <= length[:, None]).astype(jnp.int32), position=position,
+        states=timestep.state.reshape(-1, *timestep.state.shape[2:]))
 
 
 def _information(

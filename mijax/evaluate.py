@@ -16,7 +16,7 @@ from envs_mjx.base import Environment, EnvState
 from envs_mjx.grid import draw
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, runtime, stage1
-from mijax.agents.variants import variant
+from mijax.agents.variants import memory_of, needs_representation
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.metrics import RunError, RunFolder
@@ -59,8 +59,8 @@ def load_learner_state(run: RunFolder, seed: int, learner: Learner) -> tuple[int
     if not checkpoint.exists(run, [seed]):
         raise RunError(f"{run.path}: seed {seed} has no checkpoint yet")
     representation = None
-    if variant(learner.config.agent).uses_z_s:
-        representation = load_representation(stage1.folder_of(run, seed), learner.env)
+    if needs_representation(learner.config):
+        representation = load_representation(stage1.folder_of(run, seed), learner.domain)
     template = jax.eval_shape(learner.init, training_key(seed), representation)
     checkpoints = checkpoint.Checkpoints(run, seed)
     step, states = checkpoint.load_latest({seed: checkpoints}, template, functools.partial(print, file=sys.stderr))
@@ -95,7 +95,7 @@ def evaluate_seed(learner: Learner, state: LearnerState, key: jax.Array, episode
     """Means over greedy episodes, and the discounted return in fractions of the best possible where that is known."""
     program = jax.jit(learner.evaluate, static_argnums=2)
     results = {name: float(np.mean(values)) for name, values in program(state, key, episodes).items()}
-    best = optimum(learner.env, learner.config.evaluation.discount)
+    best = optimum(learner.domain, learner.config.evaluation.discount)
     if best is not None:
         results["of_optimum"] = results["discounted_return"] / best.discounted_return
     return results
@@ -139,8 +139,8 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]]:
         rows[str(seed)], steps[str(seed)] = evaluate_seed(learner, state, key, options.episodes), step
         if options.gif or options.text:
             gif = run.seed_path(seed) / EPISODE_FILE if options.gif else None
-            show(learner.env, play(learner, state, key), f"seed {seed}, step {step:,}", gif, options.text)
-    print(f"{config.domain}, {config.agent}, {config.memory}: {options.episodes} greedy episodes per seed")
+            show(learner.domain, play(learner, state, key), f"seed {seed}, step {step:,}", gif, options.text)
+    print(f"{config.domain}, {config.agent}, {memory_of(config)}: {options.episodes} greedy episodes per seed")
     print(table(rows, steps))
     return rows
 

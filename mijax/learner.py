@@ -7,6 +7,7 @@ devices, checkpoints and logging are wrapped around these two functions.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import cast
 
 import jax
@@ -16,9 +17,11 @@ from jax.typing import DTypeLike
 
 from envs_mjx.base import DiscreteActions, Environment, TimeStep
 from mijax.agents.dqn import DQN, AgentState, make_agent
+from mijax.agents.variants import variant
 from mijax.config import Config
 from mijax.nets.encoders import encoder_for
 from mijax.nets.frames import FrameTable
+from mijax.nets.privileged import StateShown
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, StepRecord, init_replay, sample_episodes, write
 from mijax.rollout import Episodes, EpisodeTotals, Recorder, collect_step, evaluate, start_episodes
@@ -41,7 +44,8 @@ class LearnerState:
 class Learner:
     """One agent on one environment."""
 
-    env: Environment
+    domain: Environment
+    env: Environment  # what the agent acts in: the domain, or the domain with its state shown
     config: Config
     agent: DQN
     observations: FrameTable | None  # all that the environment can show; the replay then stores which, not what
@@ -64,7 +68,27 @@ class Learner:
             iteration=jnp.zeros((), jnp.int32),
         )
         state, _ = self._collect(state, jnp.ones(()), self.warmup_steps // num_envs, key_warmup)
+        if self.agent.declaration.believes:
+            state = dataclasses.replace(state, agent=self._believe(state, jax.random.fold_in(key_agent, 1)))
         return state
+
+    def _believe(self, state: LearnerState, key: jax.Array) -> AgentState:
+        """Fit Believer's history VAE to as many random episodes as stage 1 has (paper Appendix A.5, Stage 2)."""
+        key_start, key_collect, key_update = jax.random.split(key, 3)
+        num_envs = self.config.num_envs
+        open_episodes = start_episodes(self.env, self.agent, num_envs, key_start)
+        first = self.recorder(state.representation)(open_episodes.timestep, open_episodes.previous_action)
+        replay = init_replay(first, max(self.config.stage1.episodes, num_envs), self.env.horizon)
+        random = dataclasses.replace(
+            state, episodes=open_episodes, replay=write(replay, first, open_episodes.position))
+        rounds = -(-self.config.stage1.episodes // num_envs)
+        random, _ = self._collect(random, jnp.ones(()), rounds * self.env.horizon, key_collect)
+
+        def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, None]:
+            return self.update(agent, random.replay, state.representation, key, pretrain=True)[0], None
+
+        agent, _ = jax.lax.scan(update, state.agent, jax.random.split(key_update, self.config.believer.updates))
+        return dataclasses.replace(agent, optimizer=self.agent.optimizer.init(agent.params))
 
     @property
     def warmup_steps(self) -> int:
@@ -115,11 +139,11 @@ class Learner:
         """What the replay stores, z_s among it when there is a representation."""
         phi = encoder_for(self.env.state_spec, self.config.stage1.features)
         num_actions = cast(DiscreteActions, self.env.action_spec).num
-        table = self.observations
+        table, declaration = self.observations, self.agent.declaration
 
         def record(timestep: TimeStep, previous_action: jax.Array) -> StepRecord:
             z_s = None
-            if representation is not None:
+            if representation is not None and not declaration.sees_state:
                 z_s = cast(jax.Array, phi.apply({"params": representation.phi}, timestep.state))
             index = None if table is None else table.index_of(timestep.observation).astype(_integer_for(len(table)))
             return StepRecord(
@@ -129,6 +153,7 @@ class Learner:
                 terminated=timestep.terminated,
                 truncated=timestep.truncated,
                 z_s=z_s,
+                state=None if declaration.critic is None else timestep.state,
             )
 
         return record
@@ -155,21 +180,25 @@ class Learner:
         return dataclasses.replace(state, agent=agent), jax.tree.map(jnp.mean, metrics)
 
     def update(
-        self, agent: AgentState, replay: Replay, representation: Representation | None, key: jax.Array
+        self, agent: AgentState, replay: Replay, representation: Representation | None, key: jax.Array,
+        pretrain: bool = False,
     ) -> tuple[AgentState, Metrics]:
-        """One gradient update on a batch of episodes, packed into as few rows as they need."""
+        """One gradient update on a batch of episodes, packed into as few rows as they need; `pretrain`: the agent's own
+        losses without the values'.
+        """
+        apply: Callable = self.agent.pretrain if pretrain else self.agent.update
         batch = self.config.dqn.batch_episodes
         key_sample, key_loss = jax.random.split(key)
         slots = sample_episodes(replay, key_sample, batch)
         if not self.pack:
             tokens = gather_rows(replay, slots, one_per_row(batch), batch, self.observations)
-            return self.agent.update(agent, tokens, representation, key_loss)
+            return apply(agent, tokens, representation, key_loss)
         layout = fit_folds(replay.length[slots], replay.data.reward.shape[1])
         choices = row_choices(batch // 2)
 
         def with_rows(rows: int) -> tuple[AgentState, Metrics]:
             tokens = gather_rows(replay, slots, stack_folds(layout, rows), 2 * rows, self.observations)
-            return self.agent.update(agent, tokens, representation, key_loss)
+            return apply(agent, tokens, representation, key_loss)
 
         branch = jnp.searchsorted(jnp.asarray(choices), layout.num_rows)
         return jax.lax.switch(branch, [functools.partial(with_rows, rows) for rows in choices])
@@ -177,8 +206,9 @@ class Learner:
 
 def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:
     """The learner that a configuration describes."""
+    domain, env = env, StateShown(env) if variant(config.agent).sees_state else env
     listed = env.all_observations()
-    return Learner(env, config, make_agent(env, config), None if listed is None else FrameTable(listed), pack)
+    return Learner(domain, env, config, make_agent(env, config), None if listed is None else FrameTable(listed), pack)
 
 
 def _integer_for(count: int) -> DTypeLike:

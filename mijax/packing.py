@@ -89,4 +89,5 @@ def gather_rows(
         segment=shaped(jnp.where(used, episode + 1, 0)),
         position=shaped(jnp.where(used, position, 0)),
         z_s=None if data.z_s is None else shaped(data.z_s.astype(jnp.float32)),
+        states=data.state,
     )

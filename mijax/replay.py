@@ -22,6 +22,7 @@ class StepRecord:
     terminated: jax.Array  # (E,) bool, on arriving
     truncated: jax.Array  # (E,) bool, on arriving
     z_s: jax.Array | None  # (E, F) phi(s_t), labelled once on collection; None when the agent does not use it
+    state: jax.Array | None = None  # (E, *state_shape); None but for asymmetric critics
 
 
 @struct.dataclass

@@ -10,7 +10,7 @@ import jax
 
 from envs_mjx.base import Environment
 from mijax import figures
-from mijax.config import Config, Stage1Config
+from mijax.config import Stage1Config
 from mijax.metrics import ProgressDisplay, RunError, RunFolder
 from mijax.representation import DivergenceError, learn_representation
 from mijax.representation.probe import ProbeReport, format_report, probe
@@ -48,14 +48,14 @@ def reuse(source: RunFolder, run: RunFolder, env: Environment, seeds: tuple[int,
 
 
 def representations(
-    run: RunFolder, env: Environment, config: Config, seeds: tuple[int, ...], say: Callable[[str], None]
+    run: RunFolder, env: Environment, config: Stage1Config, seeds: tuple[int, ...], say: Callable[[str], None]
 ) -> tuple[dict[int, Representation], dict[int, float]]:
     """Every seed's representation, trained where the run has none yet, and the seconds that took."""
     result, seconds = {}, {}
     for seed in seeds:
         started = time.perf_counter()
         if not (folder_of(run, seed) / FACTS_FILE).exists():
-            learn(run, env, config.stage1, seed, say)
+            learn(run, env, config, seed, say)
         result[seed] = load_representation(folder_of(run, seed), env)
         seconds[seed] = time.perf_counter() - started
     return result, seconds

@@ -20,7 +20,7 @@ from envs_mjx import registry
 from envs_mjx.base import Environment
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
-from mijax.agents.variants import variant
+from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
 from mijax.learner import make_learner
 from mijax.metrics import ProgressDisplay, RunError, RunFolder, TrackerName, make_tracker
@@ -94,8 +94,10 @@ def open_run(options: TrainOptions) -> RunFolder:
     if options.resume is not None:
         return RunFolder.open(options.resume)
     config = options.config
-    name = f"{config.domain.replace(':', '.')}-{config.agent}-{config.memory}"
-    stored = dataclasses.asdict(config) | {"seed_list": list(parse_seeds(options.seeds)), "track": options.track}
+    memory = memory_of(config)
+    name = f"{config.domain.replace(':', '.')}-{config.agent}-{memory}"
+    stored = dataclasses.asdict(config) | {
+        "memory": memory, "seed_list": list(parse_seeds(options.seeds)), "track": options.track}
     return RunFolder.create(options.out or pathlib.Path("runs") / name, stored)
 
 
@@ -142,7 +144,6 @@ class StopRequest:
 def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolder:
     """Run or go on with a training; returns its folder."""
     config, seeds = options.config, parse_seeds(options.seeds)
-    declaration = variant(config.agent)
     env = registry.make(config.domain)
     registry.check_contract(env)
     make_learner(env, config)  # refuses what cannot be trained before anything is written
@@ -150,14 +151,14 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     if source is not None:
         source.require(domain=config.domain)
     run = open_run(options)
-    if source is not None and declaration.uses_z_s:
+    if source is not None and needs_representation(config):
         stage1.reuse(source, run, env, seeds)
-    say(f"{run.path}: {declaration.title} ({config.agent}, {config.memory}) on {env.name}, seeds {list(seeds)}")
+    say(f"{run.path}: {title_of(config)} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
 
     clock = CompileClock()
     learnt, stage1_seconds = None, {}
-    if declaration.uses_z_s:
-        learnt, stage1_seconds = stage1.representations(run, env, config, seeds, say)
+    if needs_representation(config):
+        learnt, stage1_seconds = stage1.representations(run, env, stage1_of(config), seeds, say)
     runner = SeedRunner(lambda pack: make_learner(env, config, pack), seeds, config.seeds.strategy)
     checkpoints = checkpoint.open_all(run, seeds, config.checkpoint.keep)
     _start(runner, run, checkpoints, learnt, say)

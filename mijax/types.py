@@ -27,6 +27,10 @@ class Representation:
     z_s_mean: jax.Array  # (F,)  mean of z_s over the training set
     z_s_variance: jax.Array  # ()  Tr Var(z_s) over the training set: the unit of the bonus and of the auxiliary loss
 
+    def standardise(self, z_s: jax.Array) -> jax.Array:
+        """(..., F) features -> (..., F) with mean 0 and total variance 1."""
+        return (z_s - jnp.broadcast_to(self.z_s_mean, z_s.shape)) / jnp.sqrt(self.z_s_variance)
+
     def destandardise(self, z: jax.Array) -> jax.Array:
         """(..., F) network outputs of unit scale -> (..., F) predictions of z_s: no head has to learn its offset."""
         return jnp.broadcast_to(self.z_s_mean, z.shape) + jnp.sqrt(self.z_s_variance) * z
@@ -48,6 +52,7 @@ class Tokens:
     segment: jax.Array  # (R, L) int32, which episode of the row, from 1; 0 is padding
     position: jax.Array  # (R, L) int32, step within the episode
     z_s: jax.Array | None  # (R, L, F) phi(s_t), or None when the agent does not use it
+    states: jax.Array | None = None  # (R L, *state_shape) for asymmetric critics
 
     def folds(self) -> "tuple[Tokens, Tokens]":
         """The upper and the lower half of the rows: of a batch of `sample_episodes`, its two folds."""

@@ -114,7 +114,7 @@ def test_td_loss_by_hand(states: dict[str, AgentState], bootstrap: bool, trace_d
     config = changed(BASE, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay)
     agent, state, tokens = agent_of(config), states["base"], episodes()
     network: Any = jax.jit(agent.network.apply)
-    q, q_target = (network({"params": p}, tokens)[0] for p in (state.params["agent"], state.target))
+    q, q_target = (network({"params": p}, tokens).q for p in (state.params["agent"], state.target))
     expected, cut = loss_by_loops(q, q_target, np.zeros((2, ROW)), config.dqn)
     loss, metrics = jax.jit(agent.loss)(state.params, state.target, tokens, None, jax.random.key(0))
     assert 0 < cut < 6
@@ -129,7 +129,8 @@ def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: A
     agent, state, tokens, rep = agent_of(config), states["mi"], episodes(), representation()
     assert agent.information_model is not None
     network: Any = jax.jit(agent.network.apply)
-    (q, k), (q_target, _) = (network({"params": p}, tokens) for p in (state.params["agent"], state.target))
+    online, averaged = (network({"params": p}, tokens) for p in (state.params["agent"], state.target))
+    q, k, q_target = online.q, online.z_s, averaged.q
     model: Any = jax.jit(agent.information_model.apply)
     outputs = [k, *(model({"params": params}, tokens) for params in state.params["f"])]  # row i is fold i
     k, *f = (np.arange(FEATURES) + np.sqrt(2) * np.asarray(x) for x in outputs)  # in units of z_s

@@ -11,7 +11,16 @@ import pytest
 from flax import struct
 
 from envs_mjx.base import ArraySpec, DiscreteActions, Environment, TimeStep
-from mijax.config import Config, DQNConfig, EvaluationConfig, InformationConfig, NetworkConfig, Stage1Config
+from mijax.agents.variants import needs_representation
+from mijax.config import (
+    BelieverConfig,
+    Config,
+    DQNConfig,
+    EvaluationConfig,
+    InformationConfig,
+    NetworkConfig,
+    Stage1Config,
+)
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.representation.model import init_parameters, networks_for
 from mijax.types import Representation
@@ -98,7 +107,7 @@ class Run:
 
     def __init__(self, env: Environment, config: Config, pack: bool = False) -> None:
         self.learner = make_learner(env, config, pack)
-        self.representation = random_representation() if config.agent == "mi" else None
+        self.representation = random_representation() if needs_representation(config) else None
         self.init = jax.jit(self.learner.init)
         self.chunk = jax.jit(self.learner.run_chunk)
         self.evaluate = jax.jit(self.learner.evaluate, static_argnums=2)
@@ -129,6 +138,17 @@ def base() -> tuple[Run, list[LearnerState], list[dict[str, np.ndarray]]]:
         metrics.append(jax.device_get(measured))
     assert equal(run.chunk(states[1])[0], states[2])
     return run, states, metrics
+
+
+@pytest.mark.parametrize("agent", ["zp", "ua", "believer", "mdp"])
+def test_every_agent_runs_in_the_loop(agent: str):
+    stage1, believer = dataclasses.replace(CONFIG.stage1, episodes=8), BelieverConfig(samples=3, updates=2)
+    run = Run(Recall(), dataclasses.replace(CONFIG, agent=agent, memory="auto", stage1=stage1, believer=believer))
+    state, metrics = run.chunk(run.start())
+    assert int(state.agent.updates) == 12
+    assert all(np.isfinite(x) for name, x in jax.device_get(metrics).items() if not name.startswith("train/"))
+    results = run.evaluate(state, jax.random.key(0), 3)
+    assert results["return"].shape == (3,)
 
 
 def test_every_iteration_is_the_same_work(base):

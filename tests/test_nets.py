@@ -111,7 +111,12 @@ class Case:
         self.layout = one_per_row(len(LENGTHS))
         self.tokens = tokens_in(self.layout, len(LENGTHS))
         self.params = some_parameters(self.module, self.tokens)
-        self.apply = jax.jit(lambda params, tokens: self.module.apply({"params": params}, tokens))
+
+        def apply(params: Params, tokens: Tokens) -> tuple[jax.Array, jax.Array]:
+            outputs: Any = self.module.apply({"params": params}, tokens)
+            return outputs.q, outputs.z_s
+
+        self.apply = jax.jit(apply)
         self.q, self.predicted = self.apply(self.params, self.tokens)
 
     def check_same(self, tokens: Tokens, layout: Layout) -> None:
@@ -194,7 +199,7 @@ def test_padding_changes_neither_results_nor_gradients(case: Case):
     @jax.grad
     def gradient(params: Params, tokens: Any) -> jax.Array:
         outputs: Any = case.module.apply({"params": params}, tokens)
-        q, predicted = outputs
+        q, predicted = outputs.q, outputs.z_s
         real = (tokens.segment > 0).astype(jnp.float32)[..., None]
         return jnp.sum(jnp.square(q) * real) + jnp.sum(jnp.square(predicted - tokens.z_s) * real)
 
@@ -222,7 +227,7 @@ def test_images_in_half_precision(memory: MemoryName):
     half = agent_of(memory, IMAGE, dataclasses.replace(TINY, dtype="bfloat16"))
     params = some_parameters(half.network, tokens)
     assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.dtype(jnp.float32)}
-    q, exact_q = (jax.jit(agent.network.apply)({"params": params}, tokens)[0] for agent in (half, exact))
+    q, exact_q = (jax.jit(agent.network.apply)({"params": params}, tokens).q for agent in (half, exact))
     assert q.dtype == jnp.float32
     q, exact_q = of_episodes(q, layout), of_episodes(exact_q, layout)
     assert 0 < np.abs(q - exact_q).max() < 0.1 * np.abs(exact_q).max()
@@ -236,7 +241,8 @@ def test_dropout_is_off_unless_asked_for():
     network = agent_of("gpt", network=dataclasses.replace(TINY, layers=1, dropout=0.5)).network
     _, tokens = packed()
     params = {"params": some_parameters(network, tokens)}
-    dropped = jax.jit(lambda key: network.apply(params, tokens, False, rngs={"dropout": key})[0])
+    apply: Any = network.apply
+    dropped = jax.jit(lambda key: apply(params, tokens, False, rngs={"dropout": key}).q)
     assert not np.allclose(dropped(jax.random.key(0)), dropped(jax.random.key(1)))
     network.apply(params, tokens)  # needs no key
 

@@ -9,11 +9,14 @@ import optax
 from flax import struct
 
 from envs_mjx.base import DiscreteActions, Environment
-from mijax.agents.variants import Variant, variant
+from mijax.agents.variants import Variant, memory_of, variant
 from mijax.config import Config, ConfigError, require
 from mijax.losses import information as info
 from mijax.losses import td
-from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, TwoBranchQ
+from mijax.losses.belief import negative_elbo
+from mijax.nets.belief import BeliefQ
+from mijax.nets.privileged import PrivilegedQ
+from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, Outputs, TwoBranchQ
 from mijax.types import Metrics, Params, Representation, Tokens
 
 
@@ -31,19 +34,22 @@ class AgentState:
 class DQN:
     """The functions of one agent; all pure, all state in `AgentState` and `MemoryState`."""
 
+    env: Environment
     config: Config
     declaration: Variant
-    network: TwoBranchQ
+    network: TwoBranchQ | BeliefQ | PrivilegedQ
     information_model: InformationModel | None
     optimizer: optax.GradientTransformation
 
     def init(self, key: jax.Array, representation: Representation | None) -> AgentState:
         """Fresh parameters; the memoryless branch starts from psi when the agent uses a representation."""
-        tokens = _example_tokens(self.network)
+        tokens = _example_tokens(self.env, self.config.stage1.features)
         key_agent, key_f = jax.random.split(key)
         agent = dict(self.network.init(key_agent, tokens)["params"])
-        if self.declaration.uses_z_s and self.config.information.start_from_psi:
-            agent["bottom"] = cast(Representation, representation).psi
+        if representation is not None and self.declaration.sees_state:
+            agent |= {} if self.config.mdp.sees == "state" else {"phi": representation.phi, "psi": representation.psi}
+        elif representation is not None and self.config.information.start_from_psi:
+            agent["bottom"] = representation.psi
         params: dict[str, Params] = {"agent": agent}
         if self.information_model is not None:
             keys = jax.random.split(key_f, self.config.information.folds)
@@ -53,7 +59,7 @@ class DQN:
 
     def initial_memory(self, batch: int) -> MemoryState:
         """What `batch` episodes that have not started remember."""
-        return cast(MemoryState, self.network.apply({}, batch, method=TwoBranchQ.initial_state))
+        return cast(MemoryState, self.network.apply({}, batch, method="initial_state"))
 
     def act(
         self, params: Params, memory: MemoryState, observation: jax.Array, previous_action: jax.Array
@@ -90,30 +96,44 @@ class DQN:
         """As `act`, but each action is uniformly random with probability `epsilon`."""
         memory, greedy = self.act(params, memory, observation, previous_action)
         key_gate, key_action = jax.random.split(key)
-        random = jax.random.randint(key_action, greedy.shape, 0, self.network.top.num_actions, jnp.int32)
+        number = cast(DiscreteActions, self.env.action_spec).num
+        random = jax.random.randint(key_action, greedy.shape, 0, number, jnp.int32)
         return memory, jnp.where(jax.random.uniform(key_gate, greedy.shape) < epsilon, random, greedy)
 
     def loss(
         self, params: Params, target: Params, tokens: Tokens, representation: Representation | None, key: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """The sum of the TD loss, the weighted auxiliary loss and f's own loss; () and its parts."""
+        """The sum of the TD losses, the weighted auxiliary losses and f's own loss; () and its parts."""
         key_agent, key_f = jax.random.split(key)
-        q, predicted = self._apply(self.network, params["agent"], tokens, key_agent)
-        q_select = q if self._exact else self._clean(self.network, params["agent"], tokens)[0]
-        q_target, _ = self._clean(self.network, target, tokens)
-        bonus, loss, metrics = jnp.zeros_like(tokens.reward), jnp.zeros(()), {}
-        if predicted is not None:
+        if self.declaration.believes:
             scale = cast(Representation, representation)
-            loss_k, parts = info.prediction_mse(
-                scale.destandardise(predicted), cast(jax.Array, tokens.z_s), tokens.segment > 0, scale.z_s_variance)
-            loss += self.config.information.auxiliary_weight * loss_k
-            metrics |= {"loss/auxiliary": loss_k, "auxiliary/explained": parts["explained"]}
+            tokens = dataclasses.replace(tokens, z_s=scale.standardise(cast(jax.Array, tokens.z_s)))
+        online: Outputs = self._apply(self.network, params["agent"], tokens, key_agent)
+        q_select = online.q if self._exact else self._clean(self.network, params["agent"], tokens).q
+        averaged: Outputs = self._clean(self.network, target, tokens)
+        bonus = jnp.zeros_like(tokens.reward)
+        loss, metrics = self._auxiliary(online, averaged, tokens, representation)
         if self.information_model is not None:
             loss_f, bonus, parts = self._information(params["f"], tokens, representation, key_f)
-            loss += loss_f
-            metrics |= parts
-        loss_td, parts = self._td(q, q_select, q_target, bonus, tokens)
+            loss, metrics = loss + loss_f, metrics | parts
+        loss_td, parts = self._td(online, q_select, averaged, bonus, tokens)
         return loss + loss_td, metrics | parts
+
+    def pretrain(
+        self, state: AgentState, tokens: Tokens, representation: Representation, key: jax.Array
+    ) -> tuple[AgentState, Metrics]:
+        """One step of the auxiliary losses alone: Believer's second stage, on random episodes."""
+        tokens = dataclasses.replace(tokens, z_s=representation.standardise(cast(jax.Array, tokens.z_s)))
+
+        def loss(params: Params) -> tuple[jax.Array, Metrics]:
+            online: Outputs = self._apply(self.network, params["agent"], tokens, key)
+            return self._auxiliary(online, online, tokens, representation)
+
+        grads, metrics = jax.grad(loss, has_aux=True)(state.params)
+        steps, optimizer = self.optimizer.update(grads, state.optimizer, state.params)
+        params = cast(Params, optax.apply_updates(state.params, steps))
+        target = jax.tree.map(jnp.copy, params["agent"])
+        return AgentState(params, target, optimizer, state.updates), metrics
 
     def update(
         self, state: AgentState, tokens: Tokens, representation: Representation | None, key: jax.Array
@@ -128,7 +148,7 @@ class DQN:
         return AgentState(params, target, optimizer, state.updates + 1), metrics
 
     def _step(self, params: Params, *arguments: Any) -> tuple[MemoryState, jax.Array]:
-        return cast(Any, self.network.apply({"params": params}, *arguments, method=TwoBranchQ.step))
+        return cast(Any, self.network.apply({"params": params}, *arguments, method="step"))
 
     @property
     def _exact(self) -> bool:
@@ -170,56 +190,103 @@ class DQN:
         metrics = {"loss/f": loss_f, "f/explained": parts_f["explained"], "f/explained_unseen": parts_t["explained"]}
         return loss_f, options.intrinsic_weight * bonus, metrics
 
-    def _td(
-        self, q: jax.Array, q_select: jax.Array, q_target: jax.Array, bonus: jax.Array, tokens: Tokens
+    def _auxiliary(
+        self, online: Outputs, averaged: Outputs, tokens: Tokens, representation: Representation | None
     ) -> tuple[jax.Array, Metrics]:
-        """TD loss over the transitions token l -> l + 1 of the same segment; `q_select` chooses the greedy actions."""
+        """The weighted losses of the heads that the agent has besides its values; () and its parts."""
+        loss, metrics = jnp.zeros(()), {}
+        real = tokens.segment > 0
+        if online.z_s is not None:
+            scale = cast(Representation, representation)
+            loss_k, parts = info.prediction_mse(
+                scale.destandardise(online.z_s), cast(jax.Array, tokens.z_s), real, scale.z_s_variance)
+            loss += self.config.information.auxiliary_weight * loss_k
+            metrics |= {"loss/auxiliary": loss_k, "auxiliary/explained": parts["explained"]}
+        if online.next_summary is not None:
+            later = jax.lax.stop_gradient(cast(jax.Array, averaged.summary))[:, 1:]
+            loss_z, _ = info.prediction_mse(online.next_summary[:, :-1], later, _transitions(tokens))
+            loss += self.config.zp.weight * loss_z
+            metrics |= {"loss/self_prediction": loss_z}
+        if online.belief is not None:
+            decoded, mean, log_variance, log_scale = online.belief
+            loss_b, parts = negative_elbo(
+                cast(jax.Array, tokens.z_s), decoded, log_scale, mean, log_variance, real)
+            loss += self.config.believer.weight * loss_b
+            metrics |= {"loss/belief": loss_b, "belief/error": parts["error"], "belief/kl": parts["kl"]}
+        return loss, metrics
+
+    def _td(
+        self, online: Outputs, q_select: jax.Array, averaged: Outputs, bonus: jax.Array, tokens: Tokens
+    ) -> tuple[jax.Array, Metrics]:
+        """TD losses over the transitions token l -> l + 1 of the same segment, of Q(h, a) and of an asymmetric critic.
+
+        `q_select` chooses the greedy actions. Both heads regress the same targets, which an asymmetric critic's average
+        bootstraps where there is one.
+        """
         dqn = self.config.dqn
-        valid = (tokens.segment[:, :-1] == tokens.segment[:, 1:]) & (tokens.segment[:, 1:] > 0)
-        action = tokens.previous_action[:, 1:]
+        valid, action = _transitions(tokens), tokens.previous_action[:, 1:]
         ended = tokens.terminated if dqn.bootstrap_at_time_limit else tokens.terminated | tokens.truncated
         greedy = jnp.argmax(q_select, axis=-1)[:, :-1] == action
         follows = valid & greedy
         trace = dqn.trace_decay * jnp.pad(follows[:, 1:].astype(jnp.float32), ((0, 0), (0, 1)))
+        q_target = averaged.q if averaged.critic is None else averaged.critic
         target = td.watkins_returns(
             r_t=tokens.reward[:, 1:] + bonus[:, 1:],
             discount_t=dqn.discount * (1 - ended[:, 1:].astype(jnp.float32)),
             v_t=td.double_q_value(q_select[:, 1:], q_target[:, 1:]),
             trace_t=trace,
         )
-        loss, parts = td.td_loss(q[:, :-1], action, target, valid)
+        loss, parts = td.td_loss(online.q[:, :-1], action, target, valid)
         episodes = jnp.sum((tokens.position == 0) & (tokens.segment > 0), dtype=jnp.float32)
         episode_bonus = jnp.sum(jnp.where(valid, bonus[:, 1:], 0)) / jnp.maximum(episodes, 1)
-        return loss, {"loss/td": loss, "q/mean": parts["q"], "q/error": parts["td_error"], "train/bonus": episode_bonus}
+        metrics = {"loss/td": loss, "q/mean": parts["q"], "q/error": parts["td_error"], "train/bonus": episode_bonus}
+        if online.critic is not None:
+            loss_critic, _ = td.td_loss(online.critic[:, :-1], action, target, valid)
+            loss, metrics = loss + loss_critic, metrics | {"loss/critic": loss_critic}
+        return loss, metrics
+
+
+def _transitions(tokens: Tokens) -> jax.Array:
+    """(R, L - 1) bool: whether tokens l and l + 1 belong to the same episode."""
+    return (tokens.segment[:, :-1] == tokens.segment[:, 1:]) & (tokens.segment[:, 1:] > 0)
+
+
+def _network(env: Environment, config: Config, declaration: Variant) -> TwoBranchQ | BeliefQ | PrivilegedQ:
+    """The agent's network, by its declaration."""
+    num_actions = cast(DiscreteActions, env.action_spec).num
+    features, spec = config.stage1.features, env.observation_spec
+    if declaration.sees_state:
+        return PrivilegedQ(num_actions, env.state_spec, spec, features, config.mdp.sees, config.network)
+    history = HistoryEncoder(num_actions, env.horizon + 1, memory_of(config), config.network)
+    if declaration.believes:
+        return BeliefQ(history, spec, features, config.believer)
+    return TwoBranchQ(
+        history, spec, features, bottom_psi=declaration.uses_representation, predicts_state=declaration.informed,
+        predicts_itself=declaration.predicts_itself, critic=declaration.critic, state_spec=env.state_spec)
 
 
 def make_agent(env: Environment, config: Config) -> DQN:
     """The agent that a configuration names, for an environment."""
     if not isinstance(env.action_spec, DiscreteActions):
         raise ConfigError(f"--domain: {env.name} has continuous actions, accepted by this agent: discrete actions")
-    declaration = variant(config.agent)
-    net = config.network
+    declaration, net = variant(config.agent), config.network
     width = net.action_embedding + net.observation_embedding
-    require(config.memory != "gpt" or width % net.heads == 0, "network.heads", net.heads,
+    require(memory_of(config) != "gpt" or width % net.heads == 0, "network.heads", net.heads,
             f"a divisor of the transformer's width {width} (action-embedding + observation-embedding)")
-    history = HistoryEncoder(env.action_spec.num, env.horizon + 1, config.memory, config.network)
-    network = TwoBranchQ(
-        history, env.observation_spec, config.stage1.features, bottom_psi=declaration.uses_z_s,
-        predicts_state=declaration.uses_z_s)
+    network = _network(env, config, declaration)
     information_model = None
-    if declaration.uses_z_s and config.information.intrinsic_weight > 0:
-        information_model = InformationModel(history.clone(), config.stage1.features)
+    if declaration.informed and config.information.intrinsic_weight > 0:
+        information_model = InformationModel(cast(TwoBranchQ, network).top.clone(), config.stage1.features)
     dqn = config.dqn
     updates = max(1, round(config.steps * dqn.updates_per_step))
     rate = optax.linear_schedule(dqn.learning_rate, dqn.learning_rate * dqn.final_learning_rate, updates)
-    return DQN(config, declaration, network, information_model, optax.adam(rate))
+    return DQN(env, config, declaration, network, information_model, optax.adam(rate))
 
 
-def _example_tokens(network: TwoBranchQ) -> Tokens:
+def _example_tokens(env: Environment, features: int) -> Tokens:
     """One token of zeros, enough to shape the parameters."""
     zeros = jnp.zeros((1, 1), jnp.int32)
-    spec = network.observation_spec
+    seen, state = (jnp.zeros((1, *spec.shape), spec.dtype) for spec in (env.observation_spec, env.state_spec))
     return Tokens(
-        frames=jnp.zeros((1, *spec.shape), spec.dtype), frame=None, z_s=None, previous_action=zeros,
-        reward=jnp.zeros((1, 1)), terminated=zeros > 0, truncated=zeros > 0, segment=zeros + 1, position=zeros,
-    )
+        frames=seen, frame=None, z_s=jnp.zeros((1, 1, features)), previous_action=zeros, reward=jnp.zeros((1, 1)),
+        terminated=zeros > 0, truncated=zeros > 0, segment=zeros + 1, position=zeros, states=state)

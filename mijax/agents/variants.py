@@ -2,26 +2,49 @@
 
 import dataclasses
 
-from mijax.config import ConfigError
+from mijax.config import Config, ConfigError, CriticInput, MemoryKind, Stage1Config, require
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """What sets one agent apart on the shared core."""
+    """What sets one agent apart on the shared core. All act on Q(h, a) but `mdp`, which sees the state."""
 
     title: str
-    """Name in figures, with a GPT as its memory."""
+    """Name in figures, with the first of its memories."""
     summary: str
     """One line for the help text."""
-    uses_z_s: bool
-    """Whether stage 1's privileged features take part: bonus, auxiliary task, and psi as the memoryless branch."""
+    memories: tuple[MemoryKind, ...] = ("gpt", "gru", "mlp")
+    """Accepted sequence models, the agent's own first."""
+    uses_representation: bool = False
+    """Whether stage 1 takes part: the replay stores z_s, and the memoryless branch starts from psi."""
+    informed: bool = False
+    """The bonus for information on z_s and the auxiliary prediction of z_s."""
+    critic: CriticInput | None = None
+    """An asymmetric critic beside Q(h, a), whose target network both bootstrap from."""
+    predicts_itself: bool = False
+    """The auxiliary prediction of the next history summary (Eq. 6)."""
+    believes: bool = False
+    """The history reaches Q through samples of a belief p(z_s | h), fitted before and during learning."""
+    sees_state: bool = False
+    """Acts on features of the state, without a memory."""
 
 
 VARIANTS = {
     "mi": Variant(
         "Ours", "bonus for information on z_s, prediction of z_s, psi in the memoryless branch (Section 3.2)",
-        uses_z_s=True),
-    "base": Variant("DTQN", "the plain two-branch memory agent (paper Appendix A.1)", uses_z_s=False),
+        uses_representation=True, informed=True),
+    "base": Variant("DTQN", "the plain two-branch memory agent (Appendix A.1)"),
+    "zp": Variant(
+        "ZP-DRQN", "predicts its own next history summary (Appendix A.2)", memories=("gru",), predicts_itself=True),
+    "ba": Variant("BA-DTQN", "biased asymmetric: learns Q(s, a) beside Q(h, a) (Appendix A.3)", critic="state"),
+    "ua": Variant(
+        "UA-DTQN", "unbiased asymmetric: learns Q(h, s, a) beside Q(h, a) (Appendix A.4)", critic="history_state"),
+    "believer": Variant(
+        "B-DQN", "Q-learning on samples of a belief over z_s, stage 1 with a KL penalty (Appendix A.5)",
+        memories=("gpt", "gru"), uses_representation=True, believes=True),
+    "mdp": Variant(
+        "MDP", "no memory; sees the state, or stage 1's features of it: the overlap test (Fig. 4, Fig. 29)",
+        memories=("mlp",), uses_representation=True, sees_state=True),
 }
 
 
@@ -30,3 +53,33 @@ def variant(name: str) -> Variant:
     if name not in VARIANTS:
         raise ConfigError(f"--agent: got {name!r}, accepted: {', '.join(VARIANTS)}")
     return VARIANTS[name]
+
+
+def needs_representation(config: Config) -> bool:
+    """Whether stage 1 has to come first."""
+    return variant(config.agent).uses_representation and not (config.agent == "mdp" and config.mdp.sees == "state")
+
+
+def memory_of(config: Config) -> MemoryKind:
+    """The sequence model that a configuration means."""
+    memories = variant(config.agent).memories
+    if config.memory == "auto":
+        return memories[0]
+    require(config.memory in memories, "memory", config.memory, f"{', '.join(memories)} (--agent {config.agent})")
+    return config.memory
+
+
+def title_of(config: Config) -> str:
+    """Name in figures: the agent, and its memory when that is not its own."""
+    declaration = variant(config.agent)
+    memory = memory_of(config)
+    return declaration.title + ("" if memory == declaration.memories[0] else f" ({memory.upper()})")
+
+
+def stage1_of(config: Config) -> Stage1Config:
+    """Stage 1 as the agent wants it: Believer has its KL penalty in the place of CLUB, DIM and shrinkage."""
+    if not variant(config.agent).believes:
+        return config.stage1
+    return dataclasses.replace(
+        config.stage1, lambda_kl=config.believer.lambda_kl, lambda_club=0.0, lambda_dim_s=0.0, lambda_dim_o=0.0,
+        phi_shrinkage=0.0)

@@ -1,5 +1,6 @@
 """Pure functions of arrays that return a loss and metrics; they know nothing of agents or environments."""
 
+from mijax.losses.belief import kl_standard_normal, negative_elbo
 from mijax.losses.club import club_all_pairs, club_sampled, gaussian_fit, gaussian_log_density
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
@@ -23,7 +24,9 @@ __all__ = [
     "explained_variance_bonus",
     "gaussian_fit",
     "gaussian_log_density",
+    "kl_standard_normal",
     "masked_mean",
+    "negative_elbo",
     "next_feature_loss",
     "prediction_cosine",
     "prediction_mse",

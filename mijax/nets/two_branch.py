@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs_mjx.base import ArraySpec
-from mijax.config import MemoryName, NetworkConfig
+from mijax.config import CriticInput, MemoryKind, NetworkConfig
 from mijax.nets.encoders import Encoder, encoder_for
 from mijax.nets.frames import FrameTable, keep_present, take
 from mijax.nets.gpt import GPT
@@ -41,39 +41,62 @@ def frame_features(encoder: ObservationEmbedder | Encoder, tokens: Tokens) -> ja
         few, lambda module: module(take(every, present))[place], lambda module: module(every)[index], encoder)
 
 
+@struct.dataclass
+class Outputs:
+    """What a network says of every token; None where the agent has no such head."""
+
+    q: jax.Array  # (R, L, A)  action values, by which the agent acts
+    summary: jax.Array | None = None  # (R, L, W)  of the history
+    z_s: jax.Array | None = None  # (R, L, F)  predicted from the history, in units of its standard deviation
+    critic: jax.Array | None = None  # (R, L, A)  the asymmetric critic's values
+    next_summary: jax.Array | None = None  # (R, L, W)  predicted summary after the action that was taken next
+    belief: tuple[jax.Array, ...] | None = None  # decoded (R, L, F), mean and log-variance (R, L, Z), log scale ()
+
+
 class HistoryEncoder(nn.Module):
-    """The memory branch: embedded previous action and observation, then a sequence model."""
+    """The memory branch: embedded previous action and observation, then a sequence model.
+
+    Without memory (`mlp`) it is the embedded observation of the moment.
+    """
 
     num_actions: int
     max_length: int
-    memory: MemoryName
+    memory: MemoryKind
     network: NetworkConfig
 
     def setup(self) -> None:
         net, dtype = self.network, jnp.dtype(self.network.dtype)
         self.embed_action = ActionEmbedder(self.num_actions, net.action_embedding, dtype)
         self.embed_observation = ObservationEmbedder(net.observation_embedding, dtype)
+        width = net.action_embedding + net.observation_embedding
         if self.memory == "gpt":
-            width = net.action_embedding + net.observation_embedding
             self.sequence = GPT(width, self.max_length, net.layers, net.heads, net.dropout, dtype)
-        else:
+        elif self.memory == "gru":
             self.sequence = GRU(net.gru_width, dtype)
+        else:
+            self.present = nn.Dense(width, dtype=dtype)
 
     def __call__(self, tokens: Tokens, deterministic: bool = True) -> jax.Array:
         """(R L, W) a summary of the history at every token."""
         observation = frame_features(self.embed_observation, tokens)
+        if self.memory == "mlp":
+            return nn.relu(self.present(observation))
         x = jnp.concatenate([self.embed_action(tokens.previous_action.reshape(-1)), observation], axis=-1)
         return self.sequence(x, tokens.segment, tokens.position, deterministic)
 
     def initial_state(self, batch: int) -> MemoryState:
         """The memory of `batch` episodes that have not started."""
-        return MemoryState(jnp.zeros((batch,), jnp.int32), self.sequence.initial_state(batch))
+        recurrent = () if self.memory == "mlp" else self.sequence.initial_state(batch)
+        return MemoryState(jnp.zeros((batch,), jnp.int32), recurrent)
 
     def step(
         self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
     ) -> tuple[MemoryState, jax.Array]:
         """One token for each of (B,) episodes -> new memory, (B, W) history summaries."""
-        x = jnp.concatenate([self.embed_action(previous_action), self.embed_observation(observation)], axis=-1)
+        seen = self.embed_observation(observation)
+        if self.memory == "mlp":
+            return MemoryState(state.position + 1, ()), nn.relu(self.present(seen))
+        x = jnp.concatenate([self.embed_action(previous_action), seen], axis=-1)
         recurrent, summary = self.sequence.step(state.recurrent, x, state.position)
         return MemoryState(state.position + 1, recurrent), summary
 
@@ -94,29 +117,49 @@ class TwoBranchQ(nn.Module):
     observation_spec: ArraySpec
     features: int
     bottom_psi: bool  # the memoryless branch has psi's architecture, so that it can start from it
-    predicts_state: bool  # the memory branch has a head that predicts z_s (the auxiliary task)
+    predicts_state: bool = False  # the memory branch has a head that predicts z_s (the auxiliary task)
+    predicts_itself: bool = False  # and one that predicts its own next summary (Eq. 6)
+    critic: CriticInput | None = None  # an asymmetric critic of s, or of h, o and s
+    state_spec: ArraySpec | None = None  # what the critic sees
 
     def setup(self) -> None:
         net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
         if self.bottom_psi:
             self.bottom = encoder_for(self.observation_spec, self.features)
         else:
-            width = 100 if self.observation_spec.is_image else 128
-            self.bottom = ObservationEmbedder(width, dtype)
+            self.bottom = _own_encoder(self.observation_spec, dtype)
         self.q_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
         if self.predicts_state:
             self.state_head = _state_head(net, self.features)
+        if self.predicts_itself:
+            width = net.gru_width
+            self.next_head = MLP((width,), width, dtype)
+        if self.critic is not None:
+            assert self.state_spec is not None
+            self.state_encoder = _own_encoder(self.state_spec, dtype)
+            self.critic_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
 
-    def __call__(self, tokens: Tokens, deterministic: bool = True) -> tuple[jax.Array, jax.Array | None]:
-        """(R, L, A) action values and, with the auxiliary task, (R, L, F) the predicted z_s."""
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> Outputs:
+        """Action values, and what the other heads say."""
         summary = self.top(tokens, deterministic)
         z_o = frame_features(self.bottom, tokens)
-        shape = tokens.segment.shape
-        q = self.q_head(jnp.concatenate([summary, z_o.astype(summary.dtype)], axis=-1)).astype(jnp.float32)
-        predicted = None
+        both = jnp.concatenate([summary, z_o.astype(summary.dtype)], axis=-1)
+        z_s = next_summary = critic = None
         if self.predicts_state:
-            predicted = self.state_head(summary).astype(jnp.float32).reshape(*shape, self.features)
-        return q.reshape(*shape, self.top.num_actions), predicted
+            z_s = self.state_head(summary)
+        if self.predicts_itself:
+            taken = jnp.roll(tokens.previous_action, -1, axis=1).reshape(-1)
+            action = jax.nn.one_hot(taken, self.top.num_actions, dtype=summary.dtype)
+            next_summary = self.next_head(jnp.concatenate([summary, action], axis=-1))
+        if self.critic is not None:
+            state = self.state_encoder(cast(jax.Array, tokens.states))
+            seen = state if self.critic == "state" else jnp.concatenate([both, state], axis=-1)
+            critic = self.critic_head(seen)
+
+        def of_tokens(x: jax.Array) -> jax.Array:
+            return x.astype(jnp.float32).reshape(*tokens.segment.shape, -1)
+
+        return jax.tree.map(of_tokens, Outputs(self.q_head(both), summary, z_s, critic, next_summary))
 
     def initial_state(self, batch: int) -> MemoryState:
         """The memory of `batch` episodes that have not started."""
@@ -129,6 +172,11 @@ class TwoBranchQ(nn.Module):
         state, summary = self.top.step(state, observation, previous_action)
         z_o = self.bottom(observation).astype(summary.dtype)
         return state, self.q_head(jnp.concatenate([summary, z_o], axis=-1)).astype(jnp.float32)
+
+
+def _own_encoder(spec: ArraySpec, dtype: jnp.dtype) -> ObservationEmbedder:
+    """The memoryless branch of an agent that does not start from psi, and the state's of an asymmetric critic."""
+    return ObservationEmbedder(100 if spec.is_image else 128, dtype)
 
 
 class InformationModel(nn.Module):

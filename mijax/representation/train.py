@@ -18,6 +18,7 @@ from flax import struct
 
 from envs_mjx.base import Environment
 from mijax.config import ConfigError, Stage1Config
+from mijax.losses.belief import kl_standard_normal
 from mijax.losses.club import club_all_pairs, gaussian_fit
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
@@ -100,6 +101,7 @@ class Batch:
     rows: TransitionTable  # (B',) each
     weight: jax.Array  # (B',) float32, probability of each row in the batch; sums to one
     reward_weight: jax.Array  # (B',) float32, the same for the reward loss
+    noise: jax.Array | None  # (B', F) standard normal, added to z_s; None but under the KL penalty
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,7 +167,14 @@ class Problem:
         return self.data.size // self.config.batch_size
 
     def batch(self, chosen: jax.Array, key: jax.Array) -> Batch:
-        """The batch of (B,) chosen transitions, and of the rewarded ones that `key` draws."""
+        """The batch of (B,) chosen transitions, with the rewarded ones and the noise that `key` draws."""
+        rows, weight, reward_weight = self._rows(chosen, key)
+        noise = None
+        if self.config.lambda_kl > 0:
+            noise = jax.random.normal(jax.random.fold_in(key, 1), (rows.size, self.config.features))
+        return Batch(rows, weight, reward_weight, noise)
+
+    def _rows(self, chosen: jax.Array, key: jax.Array) -> tuple[TransitionTable, jax.Array, jax.Array]:
         rows, size = self.row[chosen], self.config.batch_size
         extra = self.config.rewarded if self.rewarded.size else 0
         added = self.rewarded[jax.random.randint(key, (extra,), 0, self.rewarded.size)] if extra else rows[:0]
@@ -177,10 +186,10 @@ class Problem:
             weight = jnp.asarray(np.repeat([1 / size, 0.0], [size, extra]), jnp.float32)
             drawn = (weight == 0).astype(jnp.float32)
         if not extra:
-            return Batch(table, weight, weight)
+            return table, weight, weight
         rewarded = drawn > 0
         common = jnp.where(rewarded, 0.0, weight)
-        return Batch(table, weight, 0.5 * drawn / extra + 0.5 * common / jnp.maximum(jnp.sum(common), 1 / size))
+        return table, weight, 0.5 * drawn / extra + 0.5 * common / jnp.maximum(jnp.sum(common), 1 / size)
 
 
 def optimizers(
@@ -295,6 +304,9 @@ def encoder_loss(
     """
     networks, rows, weight = problem.networks, batch.rows, batch.weight
     f = features(problem, parameters, rows)
+    mean_z_s = f.z_s
+    if batch.noise is not None:
+        f = dataclasses.replace(f, z_s=mean_z_s + batch.noise)
     fit = fit_estimator(fit, problem, batch, f.z_s, f.z_o, optimizer)
     reward, predicted_z_s, predicted_z_o = evaluate(
         networks.dynamics, parameters["dynamics"], f.z_s, f.z_o, networks.encode_action(rows.action))
@@ -305,6 +317,8 @@ def encoder_loss(
         "z_o_loss": (weights.lambda_o, next_feature_loss(predicted_z_o, f.next_z_o, rows.terminal, weight)[0]),
         "club": (weights.lambda_club, club_all_pairs(standardize(f.z_o, weight), mean, log_variance, weight)[0]),
     }
+    if batch.noise is not None:
+        terms["kl"] = problem.config.lambda_kl, weight @ kl_standard_normal(mean_z_s, jnp.zeros_like(mean_z_s))
     if f.local_s is not None:
         terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, rows.state, weight)
     if f.local_o is not None:

@@ -1,0 +1,88 @@
+"""The agent of Believer: its history reaches Q only through samples of a belief p(z_s | h) (paper Appendix A.5)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from envs_mjx.base import ArraySpec
+from mijax.config import BelieverConfig
+from mijax.nets.encoders import encoder_for
+from mijax.nets.heads import MLP
+from mijax.nets.two_branch import HistoryEncoder, MemoryState, Outputs, frame_features
+from mijax.types import Tokens
+
+NOISE_SEED = 20
+"""Of the fixed latent samples with which the agent acts and bootstraps: the same in every call."""
+
+
+class _Scalar(nn.Module):
+    """One learned number, 0 at first."""
+
+    @nn.compact
+    def __call__(self) -> jax.Array:
+        return self.param("value", nn.initializers.zeros_init(), ())
+
+
+class BeliefQ(nn.Module):
+    """Q(b, o, a), b the mean over samples z_s ~ p(z_s | h) of a learned embedding of each.
+
+    p(z_s | h) is a variational autoencoder: a summary x of the history (Table 2: 16 wide) and a standard normal latent
+    (Table 2: 16) decode to z_s, in units of its standard deviation. In gradient passes latents are drawn afresh.
+    """
+
+    top: HistoryEncoder
+    observation_spec: ArraySpec
+    features: int
+    believer: BelieverConfig
+
+    def setup(self) -> None:
+        net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
+        self.summarise = nn.Dense(self.believer.history_width, dtype=dtype)
+        self.posterior = MLP(net.auxiliary_hidden, 2 * self.believer.latent_width, dtype)
+        self.decoder = MLP(net.auxiliary_hidden, self.features, dtype)
+        self.log_scale = _Scalar()
+        self.embed_sample = MLP(net.auxiliary_hidden, net.auxiliary_hidden[-1], dtype)
+        self.bottom = encoder_for(self.observation_spec, self.features)
+        self.q_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
+
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> Outputs:
+        """Action values and, where `tokens.z_s` is given in units of its standard deviation, the terms of the VAE."""
+        x = self.summarise(self.top(tokens, deterministic))
+        z_o = frame_features(self.bottom, tokens)
+        samples = self.believer.samples
+        noise = self._fixed(samples)[None]
+        if not deterministic:
+            noise = jax.random.normal(self.make_rng("dropout"), (x.shape[0], samples, self.believer.latent_width))
+        shape = tokens.segment.shape
+        q = self._values(x, noise, z_o).reshape(*shape, -1)
+        if tokens.z_s is None:
+            return Outputs(q)
+        mean, log_variance = jnp.split(
+            self.posterior(jnp.concatenate([x, tokens.z_s.reshape(x.shape[0], -1)], axis=-1)), 2, axis=-1)
+        latent = mean + jnp.exp(0.5 * log_variance) * noise[:, 0]
+        decoded = self.decoder(jnp.concatenate([x, latent], axis=-1))
+        terms = tuple(term.astype(jnp.float32).reshape(*shape, -1) for term in (decoded, mean, log_variance))
+        return Outputs(q, belief=(*terms, self.log_scale()))
+
+    def initial_state(self, batch: int) -> MemoryState:
+        """The memory of `batch` episodes that have not started."""
+        return self.top.initial_state(batch)
+
+    def step(
+        self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
+    ) -> tuple[MemoryState, jax.Array]:
+        """One token for each of (B,) episodes -> new memory, (B, A) action values."""
+        state, summary = self.top.step(state, observation, previous_action)
+        noise = self._fixed(self.believer.samples)[None]
+        return state, self._values(self.summarise(summary), noise, self.bottom(observation))
+
+    def _fixed(self, samples: int) -> jax.Array:
+        return jax.random.normal(jax.random.key(NOISE_SEED), (samples, self.believer.latent_width))
+
+    def _values(self, x: jax.Array, noise: jax.Array, z_o: jax.Array) -> jax.Array:
+        """(N, X) summaries, (N or 1, K, Z) latents, (N, F) features of the observations -> (N, A)."""
+        noise = jnp.broadcast_to(noise, (x.shape[0], *noise.shape[1:])).astype(x.dtype)
+        repeated = jnp.broadcast_to(x[:, None], (*noise.shape[:2], x.shape[-1]))
+        z_s = self.decoder(jnp.concatenate([repeated, noise], axis=-1))
+        belief = jnp.mean(self.embed_sample(z_s), axis=1)
+        return self.q_head(jnp.concatenate([belief, z_o.astype(belief.dtype)], axis=-1)).astype(jnp.float32)

@@ -221,7 +221,7 @@ def run_intrinsic(name: str, request: Request, domains: Sequence[str]) -> None:
                     index = int(informed[0]) if len(informed) else 0
                     drawn.append((domain, config.information.intrinsic_weight, seen, index))
                     episode.draw_episode(
-                        seen, index, learner.env, request.out / f"{name}_{domain.replace(':', '.')}.png",
+                        seen, index, learner.domain, request.out / f"{name}_{domain.replace(':', '.')}.png",
                         weight=config.information.intrinsic_weight,
                         title=f"{figures.display_name(domain)}, seed {seed}, step {step:,}")
         note = note_on(request, list(steps), steps)

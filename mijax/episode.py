@@ -23,7 +23,6 @@ from mijax.figures import RING, STYLE
 from mijax.learner import Learner, LearnerState
 from mijax.losses import information as info
 from mijax.nets.encoders import encoder_for
-from mijax.nets.two_branch import Outputs
 from mijax.results import AGENT_COLOURS
 from mijax.types import Representation, Tokens
 
@@ -88,8 +87,7 @@ def _trace(learner: Learner, state: LearnerState, key: jax.Array, num: int) -> d
     env_state, timestep, previous, action = cast(tuple[EnvState, TimeStep, jax.Array, jax.Array], whole)
     length = jnp.argmax(timestep.done, axis=1).astype(jnp.int32)
     tokens = _tokens(learner, state.representation, timestep, previous, length)
-    applied, seen = agent.network.apply({"params": state.agent.target}, tokens, mutable=["intermediates"])
-    outputs = cast(Outputs, applied)
+    outputs, seen = agent.network.apply({"params": state.agent.target}, tokens, mutable=["intermediates"])
     attention = jax.tree.leaves(seen)
     return {
         "env_state": env_state, "reward": timestep.reward, "length": length, "action": action, "q": outputs.q,
@@ -107,8 +105,8 @@ def _tokens(learner: Learner, representation: Representation | None, timestep: T
     return Tokens(
         frames=timestep.observation.reshape(-1, *timestep.observation.shape[2:]), frame=None, z_s=z_s,
         previous_action=previous, reward=timestep.reward, terminated=timestep.terminated,
-        truncated=timestep.truncated, states=timestep.state.reshape(-1, *timestep.state.shape[2:]),
-        segment=(position <= length[:, None]).astype(jnp.int32), position=position)
+        truncated=timestep.truncated, segment=(position <= length[:, None]).astype(jnp.int32), position=position,
+        states=timestep.state.reshape(-1, *timestep.state.shape[2:]))
 
 
 def _information(

@@ -61,7 +61,7 @@ def report_episode(options: "ReportOptions") -> pathlib.Path:
     seen = episode.trace(learner, state, evaluation_key(seed, step), 1)
     path = (options.out or run.path) / f"episode_seed_{seed}.png"
     title = f"{display_name(config.domain)}, {config.agent}, seed {seed}, step {step:,}"
-    episode.draw_episode(seen, 0, learner.env, path, title=title, weight=config.information.intrinsic_weight)
+    episode.draw_episode(seen, 0, learner.domain, path, title=title, weight=config.information.intrinsic_weight)
     return path
 
 

@@ -91,14 +91,14 @@ def _report(share: float, reward: float, passes: bool = False) -> ProbeReport:
 
 def test_fainter_leaks_rank_higher_and_the_worst_seed_counts():
     faint, strong = quality(_report(1 - 1e-6, 1.0)), quality(_report(1 - 1e-3, 1.0))
-    np.testing.assert_allclose([faint, strong], [6 / 8, 3 / 8], rtol=1e-6)
+    np.testing.assert_allclose([faint, strong], [6 / 14, 3 / 14], rtol=1e-6)
     assert quality(_report(1.0, 1.0)) == 1.0
     assert quality(_report(1.0, -0.5)) == 0.0
     assert quality(None) == 0.0
     none: dict[int, Representation] = {}
     mixed = Candidate({}, {0: _report(1.0, 1.0, passes=True), 1: _report(1 - 1e-3, 1.0)}, 1, none)
     assert mixed.passed == 1
-    np.testing.assert_allclose(mixed.quality, 3 / 8)
+    np.testing.assert_allclose(mixed.quality, 3 / 14)
     assert Candidate({}, {0: _report(1.0, 1.0, passes=True), 1: None}, 1, none).quality == 0.0
 
 

@@ -109,7 +109,7 @@ class Planner:
         return action, PlannerState(
             chosen=chosen,
             stage=jnp.where(arrives, (stage + 1) % _STAGES, stage),
-            stuck=jnp.where(change, 0, stuck + (stage == _WORK)),
+            stuck=jnp.where(change, 0, jnp.where(stage == _WORK, stuck + 1, 0)),
             retreating=jnp.maximum(retreating - 1, 0),
             seen=objects[:, :2],
         )

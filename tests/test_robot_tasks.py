@@ -36,7 +36,7 @@ def replay(env: RobotTask, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarr
     start: RobotState = jax.tree.map(lambda x: x[0], trajectory.states)
     solved = jax.jit(lambda qpos: env.solved(dataclasses.replace(start, qpos=qpos)))
     model = copy.copy(env.physics.model)
-    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-8
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
     for body, (x, y, yaw) in zip(env.physics.placed, np.asarray(env.placed_poses(start), np.float64), strict=True):
         model.body_pos[body, :2] = x, y

@@ -31,6 +31,9 @@ _factories: dict[str, Factory] = {
     "heaven_hell": "envs_mjx.grid:HeavenHell",
     "sphinx": "envs_mjx.grid:Sphinx",
     "carflag_2d": "envs_mjx.grid:CarFlag2D",
+    "block_pulling": "envs_mjx.robot:BlockPulling",
+    "block_pushing": "envs_mjx.robot:BlockPushing",
+    "drawer_opening": "envs_mjx.robot:DrawerOpening",
 }
 
 

@@ -1,0 +1,178 @@
+"""The scripted experts (paper Appendix C.1), and demonstrations from one compiled call.
+
+An expert chooses an object at random and works on it: it hovers above where the work starts, goes down, and pulls or
+pushes. When the object does not move for a while, it changes over to the other one. It reads poses, but not which
+object is movable. Lengths in metres, angles in radians.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_mjx.robot import scene
+from envs_mjx.robot.task import RUNNING, SUCCESS, RobotState, RobotTask
+
+_STAGES = 3
+_WORK = _STAGES - 1
+_MOVED = 0.003
+"""An object that moves less in one step of work stands still: contacts give way by up to 2 mm (measured)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How one task is worked on."""
+
+    hover: float
+    """Height from which the gripper goes down."""
+    work: float
+    """Height at which it pulls or pushes."""
+    patience: int
+    """Steps of work without motion before it changes over."""
+    retreat: tuple[float, float, float, float]
+    """The action of the two steps that change over."""
+
+
+PLANS = {
+    "block_pulling": Plan(hover=0.1, work=0.03, patience=3, retreat=(0.0, 0.0, 1.0, 0.0)),
+    "block_pushing": Plan(hover=0.11, work=0.03, patience=2, retreat=(0.0, 0.0, 0.0, 0.0)),
+    "drawer_opening": Plan(hover=0.11, work=0.01, patience=3, retreat=(0.0, 0.0, 1.0, 0.0)),
+}
+_RETREAT_STEPS = 2
+_BEHIND = 0.08
+"""From the middle of a block to where the gripper goes down."""
+_SHORT_OF_PAD = 0.035
+_PULL = 0.2
+
+
+@struct.dataclass
+class PlannerState:
+    """What an expert remembers."""
+
+    chosen: jax.Array  # () int32, the object that it works on
+    stage: jax.Array  # () int32: hover, down, work
+    stuck: jax.Array  # () int32, steps of work without motion
+    retreating: jax.Array  # () int32, steps of retreat that are left
+    seen: jax.Array  # (2, 2) where the objects were before the last action
+
+
+@struct.dataclass
+class Trajectory:
+    """An episode of at most T steps; what follows its end is meaningless. `RobotTask.show` gives the images back."""
+
+    states: RobotState  # leading axis T + 1
+    actions: jax.Array  # (T, 4)
+    length: jax.Array  # () int32, steps of the episode
+    outcome: jax.Array  # () int32, how it ended: an index into `task.OUTCOMES`
+    first: jax.Array  # () int32, the object that was chosen first
+
+    @property
+    def success(self) -> jax.Array:
+        """() bool"""
+        return self.outcome == SUCCESS
+
+
+class Planner:
+    """The expert of a task. `act` is a pure function."""
+
+    def __init__(self, env: RobotTask, changes_over: bool = True) -> None:
+        """Args: changes_over: False gives one that works on its first choice for ever, for comparison."""
+        self.env = env
+        self.plan = PLANS[env.name]
+        self.changes_over = changes_over
+
+    def start(self, key: jax.Array, env_state: RobotState) -> PlannerState:
+        """Choose an object at random."""
+        return self.start_with(jax.random.bernoulli(key).astype(jnp.int32), env_state)
+
+    def start_with(self, chosen: jax.Array, env_state: RobotState) -> PlannerState:
+        """Choose the object `chosen`, () int32."""
+        zero = jnp.zeros((), jnp.int32)
+        return PlannerState(chosen, zero, zero, zero, self.env.object_poses(env_state)[:, :2])
+
+    def act(self, planner: PlannerState, env_state: RobotState) -> tuple[jax.Array, PlannerState]:
+        """The action (4,) in [-1, 1], and what to remember."""
+        objects = self.env.object_poses(env_state)
+        moved = jnp.linalg.norm(objects[planner.chosen, :2] - planner.seen[planner.chosen]) > _MOVED
+        stuck = jnp.where((planner.stage == _WORK) & ~moved, planner.stuck, 0)
+        change = (stuck >= self.plan.patience) & self.changes_over
+        chosen = jnp.where(change, 1 - planner.chosen, planner.chosen)
+        stage = jnp.where(change, 0, planner.stage)
+        retreating = jnp.where(change, _RETREAT_STEPS, planner.retreating)
+
+        error = self._waypoints(objects, chosen, env_state.goal)[stage] - env_state.qpos[:4]
+        error = error.at[3].set(_wrap_half_turn(error[3]))
+        steps = error / scene.ACTION_SCALE
+        arrives = (jnp.abs(steps) < 1).all() & (retreating == 0)
+        action = jnp.where(retreating > 0, jnp.array(self.plan.retreat, jnp.float32), jnp.clip(steps, -1.0, 1.0))
+        return action, PlannerState(
+            chosen=chosen,
+            stage=jnp.where(arrives, (stage + 1) % _STAGES, stage),
+            stuck=jnp.where(change, 0, jnp.where(stage == _WORK, stuck + 1, 0)),
+            retreating=jnp.maximum(retreating - 1, 0),
+            seen=objects[:, :2],
+        )
+
+    def _waypoints(self, objects: jax.Array, chosen: jax.Array, goal: jax.Array) -> jax.Array:
+        """(3, 4) x, y, z, yaw of the three stages."""
+        own, other = objects[chosen], objects[1 - chosen]
+        if self.env.name == "drawer_opening":
+            forth = -jnp.stack([jnp.cos(own[2]), jnp.sin(own[2])])
+            begin, end = own[:2], own[:2] + _PULL * forth
+        elif self.env.name == "block_pulling":
+            forth = _direction(other[:2] - own[:2])
+            begin, end = own[:2] - _BEHIND * forth, other[:2]
+        else:
+            forth = _direction(goal - own[:2])
+            begin, end = own[:2] - _BEHIND * forth, goal - _SHORT_OF_PAD * forth
+        yaw = jnp.arctan2(forth[1], forth[0]) + jnp.pi / 2
+        heights = jnp.array([self.plan.hover, self.plan.work, self.plan.work], jnp.float32)
+        places = jnp.clip(jnp.stack([begin, begin, end]), scene.WORKSPACE_LOW[None, :2], scene.WORKSPACE_HIGH[None, :2])
+        return jnp.concatenate([places, heights[:, None], jnp.broadcast_to(yaw, (_STAGES, 1))], axis=1)
+
+    def play(self, key: jax.Array, first: jax.Array | None = None) -> Trajectory:
+        """One episode. `first` () int32: 0 begins with the immovable object, 1 with the movable one; None: at random.
+
+        The scene is drawn as `env.reset` draws it from the first of three splits of `key`.
+        """
+        key_reset, key_start, key_steps = jax.random.split(key, 3)
+        env_state, _ = self.env.reset(key_reset)
+        planner = self.start(key_start, env_state)
+        if first is not None:
+            planner = self.start_with(jnp.where(first == 1, env_state.movable, 1 - env_state.movable), env_state)
+
+        def step(carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
+            env_state, planner = carry
+            action, planner = self.act(planner, env_state)
+            env_state, _ = self.env.step(key, env_state, action)
+            return (env_state, planner), (env_state, action)
+
+        keys = jax.random.split(key_steps, self.env.horizon)
+        _, (later, actions) = jax.lax.scan(step, (env_state, planner), keys)
+        states = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), env_state, later)
+        end = jnp.argmax(states.outcome != RUNNING).astype(jnp.int32)
+        return Trajectory(states, actions, end, states.outcome[end], planner.chosen)
+
+
+def demonstrations(env: RobotTask, key: jax.Array, number: int = 80, spare: float = 0.25) -> Trajectory:
+    """`number` demonstrations, successful ones first: those of a few more episodes that succeed, in their order.
+
+    Args:
+        spare: how many more episodes are played, as a fraction of `number`.
+
+    Returns:
+        Trajectories with a leading axis `number`. Check `success`: it is False where too few succeeded.
+    """
+    episodes = jax.vmap(Planner(env).play)(jax.random.split(key, number + int(number * spare)))
+    order = jnp.argsort(~episodes.success, stable=True)[:number]
+    return jax.tree.map(lambda x: x[order], episodes)
+
+
+def _direction(vector: jax.Array) -> jax.Array:
+    return vector / jnp.maximum(jnp.linalg.norm(vector), 1e-6)
+
+
+def _wrap_half_turn(angle: jax.Array) -> jax.Array:
+    """The same angle up to half turns, in [-pi/2, pi/2): the gripper is the same after half a turn."""
+    return jnp.mod(angle + jnp.pi / 2, jnp.pi) - jnp.pi / 2

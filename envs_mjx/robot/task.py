@@ -1,0 +1,158 @@
+"""What the three robot tasks share: two objects that look the same from above, of which only one can be moved.
+
+Which one is hidden, and drawn anew at every reset. Only touching tells.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from envs_mjx.base import ArraySpec, ContinuousActions, Environment, TimeStep, Variable
+from envs_mjx.robot import depth, noise, scene
+
+OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit")
+"""What `RobotState.outcome` counts."""
+RUNNING, SUCCESS, LEFT, NOT_FINITE, TIME_LIMIT = range(5)
+
+
+@struct.dataclass
+class RobotState:
+    """Where everything is. Lengths in metres, angles in radians."""
+
+    qpos: jax.Array  # (nq,) the gripper's x, y, z, yaw, then the movable object's joints
+    qvel: jax.Array  # (nv,) their velocities
+    poses: jax.Array  # (2, 3) x, y, yaw of both objects after the reset
+    goal: jax.Array  # (2,) x, y of the goal pad; zeros in a task without one
+    movable: jax.Array  # () int32, the hidden variable: which of the two objects can be moved
+    time: jax.Array  # () int32, steps since the reset
+    outcome: jax.Array  # () int32, an index into `OUTCOMES`
+    noise_key: jax.Array  # (2,) uint32, of the noise in the image of this moment
+
+
+class RobotTask(Environment):
+    """A task given by its scene, its draws and its test of success; subclasses bring those.
+
+    Actions in [-1, 1]^4: (dx, dy, dz) x 5 cm in the world frame and a turn x pi/8. Observation (84, 84, 2) float32: the
+    depth image in metres (`envs_mjx.robot.depth`), and zeros. State: the same depth image, and that of the scene
+    without the immovable object. An episode ends with reward 1 when the task is solved, and with 0 when a block leaves
+    the workspace, when the simulation is no longer finite (the last finite moment is kept), or after 50 steps.
+    """
+
+    horizon = 50
+    action_spec = ContinuousActions(4, ("x", "y", "z", "turn"))
+    observation_spec = state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
+    opening: scene.Opening
+    variables = (Variable("movable", hidden=True, num_values=2),
+                 *(Variable(name, hidden=False) for name in (
+                     "height", "turn", "object 0 x", "object 0 y", "object 1 x", "object 1 y")))
+
+    def __init__(self, noise: float = 0.0) -> None:
+        """Args: noise: amplitude of the Perlin noise in the depth image, in metres (paper Appendix E.2: 0.007)."""
+        self.noise = noise
+        self.physics = scene.Physics(self.xml(), self.placed)
+
+    placed: Sequence[str]
+    """Bodies of the scene that stand where `placed_poses` says."""
+
+    @abc.abstractmethod
+    def xml(self, visual: bool = False) -> str:
+        """The scene as MJCF; `visual` adds what is seen but never touched, for renderers."""
+
+    @abc.abstractmethod
+    def draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw the poses (2, 3) of the objects and the goal (2,), the same for whichever object is the movable one."""
+
+    @abc.abstractmethod
+    def joints(self, pose: jax.Array) -> jax.Array:
+        """(nq - 4,) positions of the movable object's joints when it is placed at `pose` (3,)."""
+
+    @abc.abstractmethod
+    def placed_poses(self, env_state: RobotState) -> jax.Array:
+        """(len(placed), 3)"""
+
+    @abc.abstractmethod
+    def object_poses(self, env_state: RobotState) -> jax.Array:
+        """(2, 3) x, y, yaw of both objects now: of what the gripper works on."""
+
+    @abc.abstractmethod
+    def solved(self, env_state: RobotState) -> jax.Array:
+        """() bool"""
+
+    @abc.abstractmethod
+    def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Heights of the movable object, of the immovable one, and of the ground, each (84, 84)."""
+
+    def left_workspace(self, env_state: RobotState) -> jax.Array:
+        """() bool: whether the movable object is out of reach. Default: it cannot be."""
+        del env_state
+        return jnp.zeros((), bool)
+
+    def reset(self, key: jax.Array) -> tuple[RobotState, TimeStep]:
+        """Draw the scene and which object is movable; the gripper hovers above the middle."""
+        key_draw, key_movable, key_noise = jax.random.split(key, 3)
+        poses, goal = self.draw(key_draw)
+        movable = jax.random.bernoulli(key_movable).astype(jnp.int32)
+        qpos = jnp.concatenate([jnp.asarray(scene.START), self.joints(poses[movable])])
+        zero = jnp.zeros((), jnp.int32)
+        env_state = RobotState(qpos, jnp.zeros_like(qpos), poses, goal, movable, zero, zero, _noise_key(key_noise))
+        return env_state, self.show(env_state)
+
+    def step(self, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, TimeStep]:
+        """Move the gripper for 0.2 s. The dynamics are deterministic: the key serves the image's noise."""
+        qpos, qvel = self.physics.advance(
+            self.placed_poses(env_state), env_state.qpos, env_state.qvel, scene.target_of(env_state.qpos, action),
+            lambda qpos: self.solved(dataclasses.replace(env_state, qpos=qpos)))
+        finite = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
+        moved = dataclasses.replace(
+            env_state, qpos=jnp.where(finite, qpos, env_state.qpos), qvel=jnp.where(finite, qvel, env_state.qvel),
+            time=env_state.time + 1, noise_key=_noise_key(key))
+        conditions = (~finite, self.solved(moved), self.left_workspace(moved), moved.time >= self.horizon)
+        outcome = jnp.int32(RUNNING)
+        for condition, code in reversed(tuple(zip(conditions, (NOT_FINITE, SUCCESS, LEFT, TIME_LIMIT), strict=True))):
+            outcome = jnp.where(condition, jnp.int32(code), outcome)
+        moved = dataclasses.replace(moved, outcome=outcome)
+        return moved, self.show(moved)
+
+    def show(self, env_state: RobotState) -> TimeStep:
+        """What `reset` or `step` showed when it returned `env_state`: poses are all that needs to be stored."""
+        observation, state = self.render(env_state)
+        outcome = env_state.outcome
+        return TimeStep(
+            observation=observation,
+            state=state,
+            reward=(outcome == SUCCESS).astype(jnp.float32),
+            terminated=(outcome == SUCCESS) | (outcome == LEFT) | (outcome == NOT_FINITE),
+            truncated=outcome == TIME_LIMIT,
+        )
+
+    def render(self, env_state: RobotState) -> tuple[jax.Array, jax.Array]:
+        """Observation and state, each (84, 84, 2) float32."""
+        movable, immovable, ground = self.heights(env_state)
+        painted = depth.fingers(env_state.qpos[3], self.opening.painted)
+        without = jnp.maximum(movable, ground)
+        seen = depth.depth(jnp.maximum(without, immovable), env_state.qpos[2], painted)
+        if self.noise:
+            seen += noise.perlin(jax.random.wrap_key_data(env_state.noise_key), self.noise)
+        masked = depth.depth(without, env_state.qpos[2], painted)
+        return jnp.stack([seen, jnp.zeros_like(seen)], axis=-1), jnp.stack([seen, masked], axis=-1)
+
+    def ground_truth(self, env_state: RobotState) -> jax.Array:
+        """(7,) float32: which object is movable; the gripper's height and yaw; both objects relative to the gripper."""
+        movable = env_state.movable.astype(jnp.float32)
+        offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
+        return jnp.concatenate([movable[None], env_state.qpos[2:4], offsets.reshape(-1)])
+
+
+def _noise_key(key: jax.Array) -> jax.Array:
+    """(2,) uint32: a key that can be stored with the state."""
+    return jax.random.bits(key, (2,), jnp.uint32)
+
+
+def first_valid(candidates: jax.Array, valid: jax.Array) -> jax.Array:
+    """Rejection by a fixed number of draws: the first of `candidates` (N, ...) that is `valid` (N,), else the first."""
+    return candidates[jnp.argmax(valid)]

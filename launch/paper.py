@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
+from configs.paper import STEPS
 from envs_mjx import registry
 from launch.experiments import EXPERIMENTS, GRID_WORLDS, Arm
 from mijax import episode, evaluate, figures, runtime, stage1, tables, train
@@ -34,8 +35,6 @@ from mijax.results import ReportedRun, summarise
 from mijax.seeds import evaluation_key
 
 PAPER_SEEDS = 5
-PAPER_STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000}
-"""Environment steps of the paper's runs: 10 000, 10 000 and 20 000 episodes of 50 steps."""
 TRACED_EPISODES = 100
 """Episodes of each seed behind the numbers of Fig. 32."""
 SAY: Callable[[str], None] = print
@@ -147,7 +146,7 @@ def note_on(request: Request, domains: Sequence[str], steps: dict[str, int]) -> 
     """What a figure says of budgets: its own, and the paper's where that is larger."""
     parts = []
     for domain in domains:
-        own, paper = steps[domain], PAPER_STEPS.get(domain, 0)
+        own, paper = steps[domain], STEPS.get(domain, 0)
         shrunk = own < paper or len(request.seeds) < PAPER_SEEDS
         parts.append(f"{figures.display_name(domain)}: {len(request.seeds)} seed{'s' * (len(request.seeds) > 1)}, "
                      f"{own:,} steps" + (f" (paper: {PAPER_SEEDS} seeds, {paper:,} steps)" if shrunk and paper else ""))

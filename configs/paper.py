@@ -17,7 +17,7 @@ TABLE_3 = {"sphinx": {"learning_rate": 1e-3},
 
 
 def paper(config: Config, vector_observation: bool) -> Config:
-    """A domain's preset with the paper's networks, losses, schedule and budget, and its stage 1: 1000 epochs, plain Adam."""
+    """A domain's preset with the paper's networks, losses, schedule, budget and stage 1: 1000 epochs, plain Adam."""
     steps = STEPS.get(config.domain, 500_000)
     network = dataclasses.replace(
         config.network, gru_width=128, critic_hidden=(256, 256), auxiliary_hidden=(128, 128), dropout=0.1,

@@ -6,6 +6,7 @@ by `launch.arithmetic`; "of matmul" is its rate as a fraction of that of a float
 
 import argparse
 import dataclasses
+import functools
 import json
 import resource
 import sys
@@ -33,7 +34,7 @@ from mijax.nets.encoders import encoder_for
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices
 from mijax.replay import Replay, StepRecord, sample_episodes
 from mijax.representation.dataset import collect, random_action
-from mijax.representation.train import Problem, initial_state, make_epoch
+from mijax.representation.train import LossWeights, Problem, initial_state, make_epoch
 from mijax.rollout import select
 from mijax.types import Metrics, Representation
 
@@ -173,7 +174,8 @@ def bench_stage1(bench: Bench, env: Environment) -> Iterator[Result]:
         config = dataclasses.replace(config, episodes=bench.sizes.stage1_episodes, batch_size=100)
     data = collect(env, jax.random.key(0), config.episodes)
     problem = Problem.of(env, config, data)
-    state, epoch, updates = initial_state(problem, jax.random.key(1)), make_epoch(problem), problem.updates_per_epoch
+    state, updates = initial_state(problem, jax.random.key(1)), problem.updates_per_epoch
+    epoch = functools.partial(make_epoch(problem), LossWeights.of(config))
     gflop = 1e-9 * operations(epoch, state, jax.random.key(2)) / updates
     yield bench.measure(env.name, "stage 1", "updates", updates, 1, epoch, state, jax.random.key(2), gflop=gflop,
                         detail=f"batch {config.batch_size}, {updates} updates per epoch")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -161,7 +162,8 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
         panel: the quantity.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(max(4.2, 0.8 + 3.5 * len(groups)), 5.6), layout="constrained")
+        width = max(5.6, 0.8 + 3.5 * len(groups))
+        figure = Figure(figsize=(width, 6.0), layout="constrained")
         axes, entries = figure.subplots(2, len(groups), sharey=True, sharex="col", squeeze=False), {}
         for (name, runs), column in zip(groups.items(), axes.T, strict=True):
             offsets = (starts or {}).get(name, {})
@@ -178,8 +180,7 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
             _label_steps(column[-1], runs, (panel,))
             column[-1].set_xlim(0, column[-1].get_xlim()[1] + max(offsets.values(), default=0))
             entries |= dict(zip(*reversed(column[0].get_legend_handles_labels()), strict=True))
-        for axis, name in zip(axes[:, 0], ("mean, one standard deviation", "interquartile mean, 95 % interval"),
-                              strict=True):
+        for axis, name in zip(axes[:, 0], ("mean, one std", "IQM, 95 % interval"), strict=True):
             axis.set_ylabel(f"{panel.label}\n{name}")
             if panel.limits:
                 axis.set_ylim(*panel.limits)
@@ -189,7 +190,8 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
                                ncols=2 if len(groups) == 1 else 2 * len(groups), title=title, alignment="left")
         legend.get_title().set(fontsize=12, fontweight="bold")
         if note:
-            figure.supxlabel(note, x=0.01, ha="left", fontsize=7.5, color="#666666")
+            lines = textwrap.fill(note, int(17 * width))
+            figure.supxlabel(lines, x=0.01, ha="left", fontsize=7.5, color="#666666")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)
 

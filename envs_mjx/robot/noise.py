@@ -17,7 +17,7 @@ def perlin(key: jax.Array, amplitude: float = AMPLITUDE) -> jax.Array:
     """(84, 84) float32 within [-amplitude, amplitude]: one octave of gradient noise with a quintic fade, times sqrt 2.
 
     The four weighted corners of a pixel's cell are two products of matrices, since the weights of rows and columns are
-    independent: a gather of corners per pixel costs a multiple.
+    independent.
     """
     key_cells, key_gradients = jax.random.split(key)
     cells = jnp.asarray(CELLS, jnp.float32)[jax.random.randint(key_cells, (), 0, len(CELLS), jnp.int32)]

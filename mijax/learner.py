@@ -19,8 +19,8 @@ from envs_mjx.base import DiscreteActions, Environment, TimeStep
 from mijax.agents.dqn import DQN, AgentState, make_agent
 from mijax.agents.variants import variant
 from mijax.config import Config
+from mijax.frames import FrameTable
 from mijax.nets.encoders import encoder_for
-from mijax.nets.frames import FrameTable
 from mijax.nets.privileged import StateShown
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, StepRecord, init_replay, sample_episodes, write

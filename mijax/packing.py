@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mijax.nets.frames import FrameTable
+from mijax.frames import FrameTable
 from mijax.replay import Replay
 from mijax.types import Tokens
 

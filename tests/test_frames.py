@@ -7,9 +7,9 @@ import pytest
 
 from envs_mjx import registry
 from mijax.config import Config, NetworkConfig
+from mijax.frames import FrameTable, Patches, take_apart
 from mijax.learner import make_learner
 from mijax.nets.encoders import encoder_for
-from mijax.nets.frames import FrameTable, Patches, take_apart
 from mijax.nets.heads import ObservationEmbedder
 
 FEATURES = 3

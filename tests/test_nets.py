@@ -12,7 +12,7 @@ import pytest
 from envs_mjx.base import ArraySpec, DiscreteActions, Environment
 from mijax.agents.dqn import DQN, make_agent
 from mijax.config import Config, MemoryName, NetworkConfig, Stage1Config
-from mijax.nets.frames import FrameTable
+from mijax.frames import FrameTable
 from mijax.nets.gpt import sine_positions
 from mijax.packing import Layout, first_fit, gather_rows, one_per_row
 from mijax.replay import Replay, StepRecord

@@ -66,6 +66,7 @@ def contents(out: pathlib.Path) -> dict[pathlib.Path, tuple[int, int]]:
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 
+@pytest.mark.slow
 def test_an_experiment_leaves_its_figure_and_table(done: pathlib.Path) -> None:
     text = (done / "fig5.md").read_text()
     assert "1 seed, 400 steps (paper: 5 seeds, 500,000 steps)" in text
@@ -80,6 +81,7 @@ def test_an_experiment_leaves_its_figure_and_table(done: pathlib.Path) -> None:
     assert len({path.read_bytes() for path in features}) == 1
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_made_again_and_seeds_are_added(done: pathlib.Path) -> None:
     before = contents(done)
     assert paper.main(["fig5", "--seeds", "1", *command(done)]) == 0
@@ -92,6 +94,7 @@ def test_what_is_there_is_not_made_again_and_seeds_are_added(done: pathlib.Path)
     assert "| heaven_hell | 1 " in (done / "fig32.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on(done: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = RunFolder.open(done / "runs/heaven_hell/mi-gru-400/seeds_0")
     summary = run.summary()

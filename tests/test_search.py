@@ -44,6 +44,7 @@ def test_candidates_fill_every_range_evenly():
     assert all(low <= weights["lambda_dim_s"] <= high for weights in with_dim_s)
 
 
+@pytest.mark.slow
 def test_a_candidate_is_the_ordinary_training_with_its_weights(env):
     keys = {5: jax.random.key(1), 6: jax.random.key(2)}
     config = dataclasses.replace(SMALL, learning_rate=1e-5)  # so small that rounding does not grow

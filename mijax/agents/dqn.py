@@ -46,8 +46,10 @@ class DQN:
         tokens = _example_tokens(self.env, self.config.stage1.features)
         key_agent, key_f = jax.random.split(key)
         agent = dict(self.network.init(key_agent, tokens)["params"])
-        if representation is not None and self.declaration.sees_state:
-            agent |= {} if self.config.mdp.sees == "state" else {"phi": representation.phi, "psi": representation.psi}
+        if self.declaration.sees_state:
+            if self.config.mdp.sees != "state":
+                rep = cast(Representation, representation)
+                agent |= {"phi": rep.phi, "psi": rep.psi}
         elif self.declaration.uses_representation and self.config.information.start_from_psi:
             agent["bottom"] = cast(Representation, representation).psi
         params: dict[str, Params] = {"agent": agent}

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from envs_mjx.base import ArraySpec
-from mijax.nets.frames import Frames, Layers, apply_layer
+from mijax.frames import Frames, Layers, apply_layer
 
 VECTOR_HIDDEN = (128, 128)
 SMALL_IMAGE_CHANNELS = (64, 128, 256)

@@ -6,8 +6,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mijax.frames import Frames, Patches, apply_layer
 from mijax.nets.encoders import Convolution
-from mijax.nets.frames import Frames, Patches, apply_layer
 
 
 class MLP(nn.Module):

@@ -9,8 +9,8 @@ from flax import struct
 
 from envs_mjx.base import ArraySpec
 from mijax.config import CriticInput, MemoryKind, NetworkConfig
+from mijax.frames import FrameTable, keep_present, take
 from mijax.nets.encoders import Encoder, encoder_for
-from mijax.nets.frames import FrameTable, keep_present, take
 from mijax.nets.gpt import GPT
 from mijax.nets.gru import GRU
 from mijax.nets.heads import MLP, ActionEmbedder, ObservationEmbedder

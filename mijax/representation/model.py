@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from envs_mjx.base import ActionSpec, DiscreteActions, Environment
+from mijax.frames import Frames
 from mijax.nets.encoders import Encoder, encoder_for
-from mijax.nets.frames import Frames
 from mijax.types import Params
 
 ACTION_WIDTH = 16

@@ -18,12 +18,12 @@ from flax import struct
 
 from envs_mjx.base import Environment
 from mijax.config import ConfigError, Stage1Config
+from mijax.frames import Frames, Patches, keep_present, take_apart
 from mijax.losses.belief import kl_standard_normal
 from mijax.losses.club import club_all_pairs, gaussian_fit
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
 from mijax.nets.encoders import Encoder
-from mijax.nets.frames import Frames, Patches, keep_present, take_apart
 from mijax.representation.dataset import Transitions, TransitionTable, collect, tabulate
 from mijax.representation.model import Networks, evaluate, init_parameters, local_features, networks_for
 from mijax.types import Metrics, Params, Representation

@@ -4,15 +4,19 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import configs
+from mijax.agents.variants import stage1_of
+from mijax.config import Config
 from mijax.figures import display_name
 from mijax.results import AGENT_COLOURS
 
 GRID_WORLDS = ("heaven_hell", "sphinx", "carflag_2d")
 BONUS_WEIGHT = 0.5
 """Of the intrinsic reward where a domain's preset has none but the experiment is about it."""
-BELIEVER_FEATURES = ("--stage1.lambda-kl", "0.01", "--stage1.lambda-club", "0", "--stage1.lambda-dim-s", "0",
-                     "--stage1.lambda-dim-o", "0", "--stage1.phi-shrinkage", "0")
-"""Stage 1 as Believer has it (Appendix A.5): a KL penalty in the place of all others."""
+_BELIEVER = stage1_of(Config(agent="believer"))
+BELIEVER_FEATURES = tuple(
+    word for name in ("lambda_kl", "lambda_club", "lambda_dim_s", "lambda_dim_o", "phi_shrinkage")
+    for word in (f"--stage1.{name.replace('_', '-')}", f"{getattr(_BELIEVER, name):g}"))
+"""Stage 1 as Believer has it (Appendix A.5), for another agent: a KL penalty in the place of all others."""
 
 
 @dataclasses.dataclass(frozen=True)

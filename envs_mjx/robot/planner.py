@@ -17,7 +17,7 @@ from envs_mjx.robot.task import RUNNING, SUCCESS, RobotState, RobotTask
 _STAGES = 3
 _WORK = _STAGES - 1
 _MOVED = 0.003
-"""An object that moves less in one step of work stands still: contacts give way by a few tenths to millimetres."""
+"""An object that moves less in one step of work counts as standing still: contacts give way a little."""
 
 
 @dataclasses.dataclass(frozen=True)

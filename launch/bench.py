@@ -27,7 +27,9 @@ from envs_mjx.base import Environment
 from envs_mjx.grid.optimal import OptimalPolicy, plan
 from envs_mjx.grid.world import GridWorld
 from launch.arithmetic import operations
+from mijax import runtime
 from mijax.agents.dqn import AgentState
+from mijax.agents.variants import VARIANTS
 from mijax.config import Config
 from mijax.learner import Learner, make_learner
 from mijax.nets.encoders import encoder_for
@@ -36,6 +38,7 @@ from mijax.replay import Replay, StepRecord, sample_episodes
 from mijax.representation.dataset import collect, random_action
 from mijax.representation.train import LossWeights, Problem, initial_state, make_epoch
 from mijax.rollout import select
+from mijax.seeds import SeedRunner
 from mijax.types import Metrics, Representation
 
 
@@ -56,10 +59,15 @@ class Sizes:
     replay_episodes: int = 256
     batch_episodes: int | None = None
     """Episodes per stage-2 update; None: the preset's."""
+    seeds: int = 5
+    """Seeds that are trained together."""
+    chunk_steps: int = 1000
+    """Environment steps of each seed that are timed together."""
 
 
+FULL_LENGTH, TRAINED = "full length", "trained agent's replay"
 QUICK = Sizes(matrix=64, repetitions=1, batches=(1, 8), environment_steps=64, max_scan=8, stage1_episodes=30, updates=1,
-              replay_episodes=8, batch_episodes=4)
+              replay_episodes=8, batch_episodes=4, seeds=2, chunk_steps=20)
 """Tries every measurement in seconds; its numbers mean nothing."""
 
 
@@ -110,16 +118,11 @@ class Bench:
         compiled = jax.jit(function).lower(*arguments).compile()
         compile_seconds = time.perf_counter() - started
         jax.block_until_ready(compiled(*arguments))
-        seconds = min(self._time(compiled, arguments) for _ in range(self.sizes.repetitions)) / repeats
+        runs = (_seconds_of(functools.partial(compiled, *arguments)) for _ in range(self.sizes.repetitions))
+        seconds = min(runs) / repeats
         fraction = gflop / seconds / self.matmul_gflops if gflop and self.matmul_gflops else None
         return Result(domain, what, batch / seconds, unit, seconds * 1e3, compile_seconds, gflop, fraction,
                       peak_memory_mib(), detail)
-
-    @staticmethod
-    def _time(function: Callable, arguments: tuple) -> float:
-        started = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        return time.perf_counter() - started
 
 
 def peak_memory_mib() -> float:
@@ -184,14 +187,59 @@ def bench_stage1(bench: Bench, env: Environment) -> Iterator[Result]:
 def bench_stage2(bench: Bench, env: Environment) -> Iterator[Result]:
     """Gradient updates from the replay on: of episodes that last to the horizon, and of a trained agent's."""
     yield from _updates(bench, env, "stage 2", configs.preset(env.name))
+    yield from _updates(bench, env, "stage 2, paper's sizes", paper_sizes(env))
+
+
+def bench_agents(bench: Bench, env: Environment) -> Iterator[Result]:
+    """Updates of every agent with every memory at the paper's sizes, episodes that last to the horizon."""
+    for agent, declaration in VARIANTS.items():
+        for memory in () if declaration.sees_state else declaration.memories:
+            config = dataclasses.replace(paper_sizes(env), agent=agent, memory=memory)
+            yield from _updates(bench, env, f"agent {agent}, {memory}", config, (FULL_LENGTH,))
+
+
+def bench_seeds(bench: Bench, env: Environment) -> Iterator[Result]:
+    """A chunk of training, as it runs, of one seed and of several, by the strategy that `auto` picks."""
+    one = 0.0
+    for count in (1, bench.sizes.seeds):
+        config = configs.preset(env.name)
+        dqn = dataclasses.replace(config.dqn, replay_steps=100_000, warmup_episodes=config.num_envs)
+        evaluation = dataclasses.replace(config.evaluation, every=bench.sizes.chunk_steps)
+        config = dataclasses.replace(config, dqn=dqn, evaluation=evaluation)
+        representation = fresh_learner(env, config, bench.sizes)[2]
+        runner = SeedRunner(functools.partial(make_learner, env, config), range(count), "auto")
+        started = time.perf_counter()
+        runner.init(dict.fromkeys(runner.seeds, representation))
+        runner.advance()
+        compile_seconds = time.perf_counter() - started
+        seconds = min(_seconds_of(runner.advance) for _ in range(bench.sizes.repetitions))
+        one = one or seconds
+        updates = runner.learner.iterations_per_chunk * config.updates_per_iteration
+        yield Result(env.name, f"{count} seed{'s' * (count > 1)} by {runner.strategy}", updates / seconds, "updates",
+                     seconds / updates * 1e3, compile_seconds, None, None, peak_memory_mib(),
+                     f"updates of all seeds, with the environment steps between: {seconds / one:.2f} times one seed; "
+                     f"{len(jax.local_devices())} devices")
+
+
+def _seconds_of(function: Callable[[], Any]) -> float:
+    started = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - started
+
+
+def paper_sizes(env: Environment) -> Config:
+    """The preset with the paper's networks and batch; without dropout, which would add passes the paper does not make.
+    """
     preset = configs.preset(env.name)
     published = paper(preset, vector_observation=not env.observation_spec.is_image)
     network = dataclasses.replace(published.network, dropout=0.0)
     dqn = dataclasses.replace(preset.dqn, batch_episodes=published.dqn.batch_episodes)
-    yield from _updates(bench, env, "stage 2, paper's sizes", dataclasses.replace(preset, network=network, dqn=dqn))
+    return dataclasses.replace(preset, network=network, dqn=dqn)
 
 
-def _updates(bench: Bench, env: Environment, what: str, config: Config) -> Iterator[Result]:
+def _updates(
+    bench: Bench, env: Environment, what: str, config: Config, replays: Sequence[str] = (FULL_LENGTH, TRAINED)
+) -> Iterator[Result]:
     learner, agent, representation = fresh_learner(env, config, bench.sizes)
     trained = optimal_replay(env, learner, representation, bench.sizes.replay_episodes)
     if trained is None:
@@ -202,7 +250,7 @@ def _updates(bench: Bench, env: Environment, what: str, config: Config) -> Itera
     def run(agent: AgentState, replay: Replay) -> tuple[AgentState, Metrics]:
         return jax.lax.scan(lambda agent, key: learner.update(agent, replay, representation, key), agent, keys)
 
-    for name, replay in (("full length", full), ("trained agent's replay", trained)):
+    for name, replay in ((name, {FULL_LENGTH: full, TRAINED: trained}[name]) for name in replays):
         rows = rows_of_updates(learner, replay, keys)
         gflop = float(np.mean([update_gflop(learner, agent, representation, replay, r) for r in rows]))
         detail = f"{np.mean(rows):.0f} rows of {env.horizon + 1} tokens, mean episode {np.mean(replay.length):.1f}"
@@ -290,7 +338,8 @@ def show(results: Sequence[Result], console: Console) -> None:
 
 
 PARTS: dict[str, Callable[[Bench, Environment], Iterator[Result]]] = {
-    "environments": bench_environments, "acting": bench_acting, "stage1": bench_stage1, "stage2": bench_stage2}
+    "environments": bench_environments, "acting": bench_acting, "stage1": bench_stage1, "stage2": bench_stage2,
+    "agents": bench_agents, "seeds": bench_seeds}
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -306,6 +355,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
+    runtime.prepare(host_devices=runtime.cores() if "seeds" in options.only else 1)
     if not options.quick:
         jax.config.update("jax_enable_compilation_cache", False)
     bench = Bench(QUICK if options.quick else Sizes())

@@ -147,9 +147,13 @@ class DQNConfig:
     """Environment steps over which epsilon falls linearly from 1 (the paper: a tenth of a budget of 500 000)."""
     bootstrap_at_time_limit: bool = False
     """Whether the value of the last state counts when the time limit ends an episode."""
+    value_bound: float = 0.0
+    """The largest magnitude of a bootstrapped value, where it is known what an episode can earn at most (bonus
+    included); targets cannot run away beyond it. 0: none (paper)."""
 
     def __post_init__(self) -> None:
         _require_at_least("dqn.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes", "epsilon_steps")
+        _require_at_least("dqn.", self, 0, "value_bound")
         require(self.learning_rate > 0, "dqn.learning-rate", self.learning_rate, "a number > 0")
         require(self.updates_per_step > 0, "dqn.updates-per-step", self.updates_per_step, "a number > 0")
         require(self.batch_episodes % 2 == 0, "dqn.batch-episodes", self.batch_episodes, "an even number")

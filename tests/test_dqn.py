@@ -99,6 +99,8 @@ def loss_by_loops(q: Any, q_target: Any, bonus: np.ndarray, dqn: DQNConfig) -> t
         later = 0.0
         for t in reversed(range(first + 1, end)):  # the transition that arrives at token t
             value = q_target[row, t, np.argmax(q[row, t])]
+            if dqn.value_bound:
+                value = min(max(value, -dqn.value_bound), dqn.value_bound)
             ended = tokens.terminated[row, t] or (tokens.truncated[row, t] and not dqn.bootstrap_at_time_limit)
             greedy_next = t + 1 < end and tokens.previous_action[row, t + 1] == np.argmax(q[row, t])
             cut += t + 1 < end and not greedy_next
@@ -109,9 +111,10 @@ def loss_by_loops(q: Any, q_target: Any, bonus: np.ndarray, dqn: DQNConfig) -> t
     return float(np.mean(np.square(errors))), cut
 
 
-@pytest.mark.parametrize(("bootstrap", "trace_decay"), [(False, 0.0), (True, 0.7)])
-def test_td_loss_by_hand(states: dict[str, AgentState], bootstrap: bool, trace_decay: float):
-    config = changed(BASE, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay)
+@pytest.mark.parametrize(
+    ("bootstrap", "trace_decay", "bound"), [(False, 0.0, 0.0), (True, 0.7, 0.0), (True, 0.7, 0.1)])
+def test_td_loss_by_hand(states: dict[str, AgentState], bootstrap: bool, trace_decay: float, bound: float):
+    config = changed(BASE, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay, value_bound=bound)
     agent, state, tokens = agent_of(config), states["base"], episodes()
     network: Any = jax.jit(agent.network.apply)
     q, q_target = (network({"params": p}, tokens).q for p in (state.params["agent"], state.target))

@@ -232,6 +232,8 @@ class DQN:
         follows = valid & greedy
         trace = dqn.trace_decay * jnp.pad(follows[:, 1:].astype(jnp.float32), ((0, 0), (0, 1)))
         q_target = averaged.q if averaged.critic is None else averaged.critic
+        if dqn.value_bound > 0:
+            q_target = jnp.clip(q_target, -dqn.value_bound, dqn.value_bound)
         target = td.watkins_returns(
             r_t=tokens.reward[:, 1:] + bonus[:, 1:],
             discount_t=dqn.discount * (1 - ended[:, 1:].astype(jnp.float32)),

@@ -37,7 +37,8 @@ def test_quick_bench_reports_every_part_as_json(domain, capsys, monkeypatch):
     what = [result["what"] for result in report["results"]]
     assert what == ["float32 matmul 64", "environment, batch 1", "environment, batch 8", "acting, batch 4", "stage 1",
                     "stage 2, full length", "stage 2, trained agent's replay", "stage 2, paper's sizes, full length",
-                    "stage 2, paper's sizes, trained agent's replay", "agent zp, gru, full length", "1 seed by map", "2 seeds by shard"]
+                    "stage 2, paper's sizes, trained agent's replay", "agent zp, gru, full length",
+                    "1 seed by map", "2 seeds by shard"]
     for result in report["results"][1:]:
         assert result["domain"] == domain
         assert result["per_second"] > 0

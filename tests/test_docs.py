@@ -1,0 +1,70 @@
+"""What the documentation names exists: every dotted name can be imported, every command can be parsed."""
+
+import functools
+import importlib
+import pathlib
+import re
+import shlex
+from collections.abc import Callable
+
+import pytest
+import tyro
+
+from launch import bench
+from launch import paper as experiments
+from mijax import evaluate, report, represent, train
+
+ROOT = pathlib.Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "results").rglob("*.md"))]
+NAME = re.compile(r"`((?:mijax|envs_mjx|configs|launch)(?:\.\w+)+)`")
+COMMAND = re.compile(r"python -m ([\w.]+)([^\n`#|;)]*)")
+LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
+
+
+def resolve(name: str) -> object:
+    """The module, class, function or attribute of a dotted name."""
+    parts = name.split(".")
+    for split in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:split]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[split:]:
+            found = getattr(found, part)
+        return found
+    raise ModuleNotFoundError(name)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_names_links_and_modules_of_commands_exist(page: pathlib.Path):
+    text = page.read_text(encoding="utf-8")
+    for name in NAME.findall(text):
+        resolve(name)
+    for module, _ in COMMAND.findall(text):
+        assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
+    for link in LINK.findall(text):
+        assert (page.parent / link).exists(), link
+
+
+def options_of(kind: type, words: list[str]) -> object:
+    """As the command builds them."""
+    return tyro.cli(kind, args=words)
+
+
+PARSERS: dict[str, Callable[[list[str]], object]] = {
+    "mijax.train": train.parse, "mijax.represent": represent.parse,
+    "mijax.evaluate": functools.partial(options_of, evaluate.EvaluateOptions),
+    "mijax.report": functools.partial(options_of, report.ReportOptions),
+    "launch.paper": experiments.parse, "launch.bench": bench.parse}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "results" not in page.parts],
+                         ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_are_accepted(page: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    """Parsed, not run. Run folders that a reader would put in stand for any that exists."""
+    monkeypatch.chdir(tmp_path)
+    for module, arguments in COMMAND.findall(page.read_text(encoding="utf-8")):
+        words = shlex.split(arguments)
+        if "--help" in words or "--resume" in words:
+            continue
+        PARSERS[module](words)

@@ -279,12 +279,16 @@ LEARNING = dataclasses.replace(
                           auxiliary_hidden=(32,)),
     dqn=DQNConfig(batch_episodes=16, updates_per_step=0.25, learning_rate=3e-3, target_rate=0.02, epsilon_steps=1000,
                   replay_steps=20_000),
-    evaluation=EvaluationConfig(every=3200),
+    evaluation=EvaluationConfig(every=3200), believer=BelieverConfig(samples=4, updates=300),
 )
 
 
+SLOW_LEARNERS = (("mi", "gpt"), ("mi", "gru"), ("base", "gpt"), ("zp", "gru"), ("ba", "gpt"), ("ba", "gru"),
+                 ("ua", "gpt"), ("ua", "gru"), ("believer", "gpt"), ("believer", "gru"), ("mdp", "mlp"))
+
+
 @pytest.mark.parametrize(("agent", "memory"), [
-    ("base", "gru"), pytest.param("mi", "gpt", marks=pytest.mark.slow)])
+    ("base", "gru"), *(pytest.param(*names, marks=pytest.mark.slow) for names in SLOW_LEARNERS)])
 def test_a_memory_task_is_solved(agent: str, memory: Any):
     run = Run(Recall(), dataclasses.replace(LEARNING, agent=agent, memory=memory))
     state, _ = run.chunk(run.start())

@@ -1,0 +1,1 @@
+"""Environments of one's own, from a few lines on."""

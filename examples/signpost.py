@@ -1,6 +1,6 @@
 """A smallest environment of one's own: a corridor with a signpost at one end and a fork at the other.
 
-    python -m mijax.train --domain examples.signpost:Signpost --steps 20000
+    python -m mijax.train --domain examples.signpost:Signpost --steps 40000
 """
 
 import jax

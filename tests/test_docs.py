@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 import tyro
 
-from launch import bench
+from launch import bench, sweep
 from launch import paper as experiments
 from mijax import evaluate, report, represent, train
 
@@ -54,6 +54,7 @@ def options_of(kind: type, words: list[str]) -> object:
 PARSERS: dict[str, Callable[[list[str]], object]] = {
     "mijax.train": train.parse, "mijax.represent": represent.parse,
     "mijax.evaluate": functools.partial(options_of, evaluate.EvaluateOptions),
+    "launch.sweep": sweep.parse,
     "mijax.report": functools.partial(options_of, report.ReportOptions),
     "launch.paper": experiments.parse, "launch.bench": bench.parse}
 

@@ -1,0 +1,195 @@
+"""Sweeps: what a file means, and that no death of a process loses or repeats a job."""
+
+import io
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import pytest
+from rich.console import Console
+
+from launch import sweep
+from launch.sweep import Job, Local, OnRay, Sweep
+from mijax.config import ConfigError
+
+SPEC = """
+options: {steps: 2000, num_envs: 4}
+grid:
+  domain: [heaven_hell, "examples.signpost:Signpost"]
+  agent: [base]
+  dqn.learning-rate: [1.0e-3, 3.0e-4]
+seeds: 3
+seeds_per_job: 2
+"""
+
+
+def test_the_example_is_one():
+    found = sweep.read(pathlib.Path(__file__).parents[1] / "examples" / "sweep.yaml", pathlib.Path("out"))
+    assert [job.name for job in found.jobs] == [
+        f"{memory}-information.auxiliary-weight={weight}" for memory in ("gpt", "gru") for weight in (0.5, 0.0)]
+
+
+def written(tmp_path: pathlib.Path, text: str) -> pathlib.Path:
+    path = tmp_path / "spec.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_every_combination_is_a_job(tmp_path: pathlib.Path):
+    found = sweep.read(written(tmp_path, SPEC), tmp_path)
+    assert len(found.jobs) == len({job.name for job in found.jobs}) == 2 * 2 * 2
+    assert (found.cpus, found.gpus, found.retries) == (1, 0.0, 2)
+    first = found.jobs[0]
+    assert first.name == "heaven_hell-base-dqn.learning-rate=0.001-seeds=0_1"
+    assert first.arguments == ("--steps", "2000", "--num-envs", "4", "--domain", "heaven_hell", "--agent", "base",
+                               "--dqn.learning-rate", "0.001", "--seeds", "0,1,")
+    assert found.jobs[1].arguments[-1] == "2,"
+    assert all("/" not in job.name and ":" not in job.name for job in found.jobs)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("grid: 3", "a mapping `grid`"),
+    ("grid: {agent: [mi]}\nsteps: 3", "the keys options, grid, seeds"),
+    ("grid: {agent: mi}", "spec grid.agent: got 'mi', accepted: a list of values"),
+    ("grid: {agent: [mi]}\nretries: -1", "spec retries: got -1, accepted: a number >= 0"),
+    ("grid: {agent: [mi]}\nresources: {tpus: 1}", "the keys cpus, gpus"),
+    ("grid: {agent: [mi]}\nresources: {cpus: 0}", "spec resources.cpus: got 0"),
+    ("grid: {out: [a]}", "spec out: got 'out', accepted: nothing here"),
+    ("grid: {agent: [mi]}\nseeds_per_job: 0", "spec seeds_per_job: got 0"),
+    ("grid: {dqn.learning-rate: [fast]}", "dqn.learning-rate=fast: options .* are not accepted"),
+    ("grid: {dqn.learning-rate: [-1.0]}", "dqn.learning-rate"),
+    ("grid: [", "cannot be read"),
+])
+def test_a_bad_file_is_refused_before_anything_runs(tmp_path: pathlib.Path, text: str, message: str):
+    with pytest.raises(ConfigError, match=message):
+        sweep.read(written(tmp_path, text), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--workers", "0"], "workers: got 0"), (["--address", "auto"], "address: got 'auto', accepted: nothing")])
+def test_bad_options(arguments: list[str], message: str):
+    with pytest.raises(ConfigError, match=message):
+        sweep.parse(["spec.yaml", *arguments])
+
+
+class Scripted(Job):
+    """A job whose process runs a script in place of a training, as often as it is started."""
+
+    def command(self, cores: object) -> list[str]:
+        begin = f"""
+            import os, pathlib, signal, sys, time
+            path = pathlib.Path({str(self.path)!r})
+            path.mkdir(exist_ok=True)
+            starts = path / "starts"
+            starts.write_text((starts.read_text() if starts.exists() else "") + "x")
+            def end(): (path / "summary.json").write_text("{{}}")
+        """
+        return [sys.executable, "-c", textwrap.dedent(begin) + textwrap.dedent(self.arguments[0])]
+
+    @property
+    def starts(self) -> int:
+        """How often it was started."""
+        return len((self.path / "starts").read_text())
+
+
+DIES_ONCE = "os.kill(os.getpid(), signal.SIGKILL) if len(starts.read_text()) < 2 else end()"
+FAILS = "sys.exit('error: --steps: got 0, accepted: a number >= 1')"
+WAITS = "print('working', flush=True)\ntime.sleep(600)"
+
+
+def run(*jobs: Job, retries: int = 2) -> dict[str, str]:
+    return dict(sweep.watch(Sweep(jobs, 1, 0.0, retries), Local(Sweep(jobs, 1, 0.0, retries), 2),
+                            Console(file=io.StringIO())))
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "REFRESH_SECONDS", 0.05)
+
+
+def test_a_killed_job_goes_on_and_a_failed_one_does_not(tmp_path: pathlib.Path):
+    dies, fails, keeps_dying = (Scripted(name, (script,), tmp_path) for name, script in (
+        ("dies", DIES_ONCE), ("fails", FAILS), ("keeps_dying", "os.kill(os.getpid(), signal.SIGKILL)")))
+    assert run(dies, fails, keeps_dying) == {"dies": "done", "fails": "failed", "keeps_dying": "failed"}
+    assert (dies.starts, fails.starts, keeps_dying.starts) == (2, 1, 3)
+    assert sweep.last_words(fails) == "error: --steps: got 0, accepted: a number >= 1"
+    assert run(dies) == {"dies": "done"}
+    assert dies.starts == 2
+
+
+def test_stopping_asks_the_running_jobs_to_save_and_starts_no_other(tmp_path: pathlib.Path):
+    jobs = [Scripted(name, (WAITS,), tmp_path) for name in ("one", "two", "three")]
+    backend = Local(Sweep(tuple(jobs), 1, 0.0, 2), 2)
+    deadline = time.monotonic() + 60
+    while sweep.last_words(jobs[0]) != "working" or sweep.last_words(jobs[1]) != "working":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    backend.stop()
+    assert backend.states == {"one": "stopped", "two": "stopped", "three": "waiting"}
+
+
+def test_a_job_goes_on_with_its_own_run(tmp_path: pathlib.Path):
+    job = Job("a", ("--domain", "sphinx"), tmp_path)
+    assert job.command([0, 1])[3:] == ["0,1", str(os.getpid()), "--domain", "sphinx", "--out", str(tmp_path / "a")]
+    job.path.mkdir()
+    (job.path / "config.json").write_text(json.dumps({"domain": "sphinx"}))
+    assert job.command([])[3:] == ["", str(os.getpid()), "--resume", str(tmp_path / "a")]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a feature of Linux")
+def test_a_job_dies_with_the_process_that_started_it(tmp_path: pathlib.Path):
+    child = "from launch.job import prepare; import os, sys, time; prepare([0], int(sys.argv[1])); " \
+            "print(os.getpid(), sorted(os.sched_getaffinity(0)), flush=True); time.sleep(600)"
+    starter = f"import os, subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}, str(os.getpid())])"
+    parent = subprocess.Popen([sys.executable, "-c", starter], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid, cores = parent.stdout.readline().split(maxsplit=1)
+    assert cores.strip() == "[0]"
+    parent.send_signal(signal.SIGKILL)
+    parent.communicate()
+    deadline = time.monotonic() + 30
+    while pathlib.Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not pathlib.Path(f"/proc/{pid}").exists()
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_loses_a_worker_and_a_node(tmp_path: pathlib.Path):
+    """Every job is done in the end, and none was done twice."""
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    node = cluster.add_node(num_cpus=2)
+    ray.init(address=cluster.address, log_to_driver=False)
+    try:
+        script = "(path / 'pid').write_text(str(os.getppid())); time.sleep(3); end()"
+        jobs = tuple(Scripted(f"job_{i}", (script,), tmp_path) for i in range(6))
+        states: dict[str, str] = {}
+
+        def work() -> None:
+            plan = Sweep(jobs, 1, 0.0, 3)
+            states.update(sweep.watch(plan, OnRay(plan), Console(file=io.StringIO())))
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        deadline = time.monotonic() + 120
+        while not any((job.path / "pid").exists() for job in jobs):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        running = next(job for job in jobs if (job.path / "pid").exists())
+        os.kill(int((running.path / "pid").read_text()), signal.SIGKILL)
+        cluster.remove_node(node)
+        thread.join(300)
+        assert states == {job.name: "done" for job in jobs}
+    finally:
+        ray.shutdown()
+        cluster.shutdown()

@@ -8,6 +8,8 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
 OUT ?= runs/heaven_hell
 ARGS ?=
+# One process per core; the tests of a file stay together, since they share compiled programs.
+PARALLEL := --numprocesses auto --dist loadfile
 
 VENV := .venv
 RUN := $(VENV)/bin/python
@@ -27,10 +29,10 @@ train: $(INSTALLED)
 	fi
 
 test: $(INSTALLED)
-	$(RUN) -m pytest -m "not slow" $(ARGS)
+	$(RUN) -m pytest -m "not slow" $(PARALLEL) $(ARGS)
 
 test-slow: $(INSTALLED)
-	$(RUN) -m pytest -m slow $(ARGS)
+	$(RUN) -m pytest -m slow $(PARALLEL) $(ARGS)
 
 lint: $(INSTALLED)
 	$(RUN) -m ruff check .

@@ -8,7 +8,9 @@ REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 
 # These are read when jax is first imported, and are inherited by the commands that tests start.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
+# A cache of its own for each process: one could read what another is still writing.
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax" / os.environ.get("PYTEST_XDIST_WORKER", "alone")))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("MPLBACKEND", "Agg")
 if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):

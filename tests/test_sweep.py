@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 from launch import sweep
+from launch.job import available_cores
 from launch.sweep import Job, Local, OnRay, Sweep
 from mijax.config import ConfigError
 
@@ -145,13 +146,14 @@ def test_a_job_goes_on_with_its_own_run(tmp_path: pathlib.Path):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a feature of Linux")
 def test_a_job_dies_with_the_process_that_started_it(tmp_path: pathlib.Path):
-    child = "from launch.job import prepare; import os, sys, time; prepare([0], int(sys.argv[1])); " \
-            "print(os.getpid(), sorted(os.sched_getaffinity(0)), flush=True); time.sleep(600)"
+    core = available_cores()[0]
+    child = f"from launch.job import prepare; import os, sys, time; prepare([{core}], int(sys.argv[1])); " \
+            "print(os.getpid(), *os.sched_getaffinity(0), flush=True); time.sleep(600)"
     starter = f"import os, subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}, str(os.getpid())])"
     parent = subprocess.Popen([sys.executable, "-c", starter], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     pid, cores = parent.stdout.readline().split(maxsplit=1)
-    assert cores.strip() == "[0]"
+    assert cores.split() == [str(core)]
     parent.send_signal(signal.SIGKILL)
     parent.communicate()
     deadline = time.monotonic() + 30

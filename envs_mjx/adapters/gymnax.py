@@ -80,7 +80,7 @@ class FromGymnax(Environment):
         """As gymnax steps, without its reset."""
         before, time = env_state
         if isinstance(self.action_spec, ContinuousActions):
-            action = self._low + 0.5 * (action + 1) * (self._high - self._low)
+            action = jnp.asarray(self._low + 0.5 * (action + 1) * (self._high - self._low))
         observation, state, reward, terminated, _ = self._gymnax.step_env(key, before, action, self._params)
         state = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), state, before)
         after = (state, time + 1)

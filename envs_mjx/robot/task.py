@@ -28,6 +28,7 @@ class RobotState:
     qvel: jax.Array  # (nv,) their velocities
     poses: jax.Array  # (2, 3) x, y, yaw of both objects after the reset
     goal: jax.Array  # (2,) x, y of the goal pad; zeros in a task without one
+    touched: jax.Array  # () bool, whether a finger has touched an object since the reset
     movable: jax.Array  # () int32, the hidden variable: which of the two objects can be moved
     time: jax.Array  # () int32, steps since the reset
     outcome: jax.Array  # () int32, an index into `OUTCOMES`
@@ -48,8 +49,7 @@ class RobotTask(Environment):
     observation_spec = state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
     opening: scene.Opening
     variables = (Variable("movable", hidden=True, num_values=2),
-                 *(Variable(name, hidden=False) for name in (
-                     "height", "turn", "object 0 x", "object 0 y", "object 1 x", "object 1 y")))
+                 *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 
     def __init__(self, noise: float = 0.0) -> None:
         """Args: noise: amplitude of the Perlin noise in the depth image, in metres (paper Appendix E.2: 0.007)."""
@@ -103,18 +103,20 @@ class RobotTask(Environment):
         movable = jax.random.bernoulli(key_movable).astype(jnp.int32)
         qpos = jnp.concatenate([jnp.asarray(scene.START), self.joints(poses[movable])])
         zero = jnp.zeros((), jnp.int32)
-        env_state = RobotState(qpos, jnp.zeros_like(qpos), poses, goal, movable, zero, zero, _noise_key(key_noise))
+        env_state = RobotState(
+            qpos=qpos, qvel=jnp.zeros_like(qpos), poses=poses, goal=goal, touched=jnp.zeros((), bool), movable=movable,
+            time=zero, outcome=zero, noise_key=_noise_key(key_noise))
         return env_state, self.show(env_state)
 
     def step(self, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, TimeStep]:
         """Move the gripper for 0.2 s. The dynamics are deterministic: the key serves the image's noise."""
-        qpos, qvel = self.physics.advance(
+        qpos, qvel, touched = self.physics.advance(
             self.placed_poses(env_state), env_state.qpos, env_state.qvel, scene.target_of(env_state.qpos, action),
             lambda qpos: self.solved(dataclasses.replace(env_state, qpos=qpos)))
         finite = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
         moved = dataclasses.replace(
             env_state, qpos=jnp.where(finite, qpos, env_state.qpos), qvel=jnp.where(finite, qvel, env_state.qvel),
-            time=env_state.time + 1, noise_key=_noise_key(key))
+            touched=env_state.touched | touched, time=env_state.time + 1, noise_key=_noise_key(key))
         conditions = (~finite, self.solved(moved), self.left_workspace(moved), moved.time >= self.horizon)
         outcome = jnp.int32(RUNNING)
         for condition, code in reversed(tuple(zip(conditions, (NOT_FINITE, SUCCESS, LEFT, TIME_LIMIT), strict=True))):
@@ -165,10 +167,17 @@ class RobotTask(Environment):
         return dataclasses.replace(turned, noise_key=noise_key), rotation.rotate_action(action, angle)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(7,) float32: which object is movable; the gripper's height and yaw; both objects relative to the gripper."""
-        movable = env_state.movable.astype(jnp.float32)
+        """(4,) float32: which object is movable; the gripper's height; where the nearer object is from the gripper.
+
+        The other object is often out of view.
+        """
         offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
-        return jnp.concatenate([movable[None], env_state.qpos[2:4], offsets.reshape(-1)])
+        nearer = offsets[jnp.argmin(jnp.sum(jnp.square(offsets), axis=1))]
+        return jnp.concatenate([env_state.movable.astype(jnp.float32)[None], env_state.qpos[2:3], nearer])
+
+    def reveals(self, env_state: RobotState) -> jax.Array:
+        """() bool: whether an object has been touched, from when on what is seen can tell which one moves."""
+        return env_state.touched
 
 
 def turn_common(env_state: RobotState, angle: jax.Array) -> RobotState:

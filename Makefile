@@ -3,6 +3,7 @@
 #   make train [OUT=runs/heaven_hell] [ARGS="--seeds 5"]   a new run, or on with the one in OUT
 #   make test  [ARGS="-k losses"]                          the tests, without the slow ones
 #   make test-slow   make lint   make bench   make clean
+#   make viewer      the scripts inside the pages of `mijax.evaluate --planner --html`; needs npm
 
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
@@ -15,7 +16,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: train test test-slow lint bench clean
+.PHONY: train test test-slow lint bench viewer clean
 .DELETE_ON_ERROR:
 
 # config.json is the last file that a new run folder gets, so its presence means that there is a run to go on with.
@@ -40,6 +41,11 @@ lint: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(RUN) -m launch.bench $(ARGS)
+
+# The versions that brax 0.14.2's viewer was written for.
+viewer: $(INSTALLED)
+	npm install --silent --no-save --no-audit --no-fund --prefix .cache/viewer three@0.150.1 lil-gui@0.18.0
+	$(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[robot]'
 
 clean:
 	rm -rf $(VENV) .cache .pytest_cache .ruff_cache .hypothesis build dist

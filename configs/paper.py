@@ -12,7 +12,13 @@ STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000}
 """10 000 and 20 000 episodes of 50 steps."""
 EPOCHS = 1000
 TABLE_3 = {"sphinx": {"learning_rate": 1e-3},
-           "carflag_2d": {"learning_rate": 1e-3, "episodes": 1000, "lambda_r": 1.0}}
+           "carflag_2d": {"learning_rate": 1e-3, "episodes": 1000, "lambda_r": 1.0},
+           "block_pulling": {"learning_rate": 1e-3, "batch_size": 500, "lambda_r": 10.0, "lambda_s": 0.1,
+                             "lambda_club": 10.0, "lambda_dim_s": 0.1},
+           "block_pushing": {"learning_rate": 1e-3, "batch_size": 500, "lambda_r": 100.0, "lambda_s": 1.0,
+                             "lambda_club": 0.001, "lambda_dim_s": 0.01},
+           "drawer_opening": {"learning_rate": 1e-3, "batch_size": 500, "lambda_r": 100.0, "lambda_s": 1.0,
+                              "lambda_club": 1.0, "lambda_dim_s": 0.001}}
 """Where a preset's stage 1 is not that of Table 3."""
 
 

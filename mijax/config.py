@@ -11,6 +11,8 @@ CriticInput = Literal["state", "history_state"]
 """What an asymmetric critic sees beside the action: s, or h and s."""
 PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
 IntrinsicForm = Literal["explained_variance", "cosine"]
+DataSource = Literal["random", "demonstrations"]
+"""Whose episodes stage 1 learns from: a random policy's, or those of the environment's expert."""
 SeedStrategy = Literal["auto", "map", "vmap", "shard"]
 
 
@@ -40,8 +42,13 @@ class Stage1Config:
     The defaults, with which environments of one's own start, are Table 3's for Heaven-Hell, but for fewer epochs.
     """
 
+    data: DataSource = "random"
+    """Whose episodes: of a random policy, or of the domain's expert (the robot tasks)."""
     episodes: int = 500
-    """Episodes of a random policy in the training set."""
+    """Episodes in the training set."""
+    copies: int = 0
+    """Copies of every demonstrated transition, each moved by a symmetry of the task (a random turn; drawn anew in every
+    epoch) beside the original (Table 3)."""
     heldout_episodes: int = 100
     """Further episodes that only the probe sees."""
     epochs: int = 200
@@ -80,7 +87,9 @@ class Stage1Config:
         _require_at_least("stage1.", self, 1, "episodes", "heldout_episodes", "epochs", "batch_size", "features",
                           "estimator_updates")
         _require_at_least("stage1.", self, 0, "lambda_r", "lambda_s", "lambda_o", "lambda_club", "lambda_dim_s",
-                          "lambda_dim_o", "lambda_kl", "rewarded", "phi_shrinkage")
+                          "lambda_dim_o", "lambda_kl", "rewarded", "phi_shrinkage", "copies")
+        require(self.copies == 0 or self.data == "demonstrations", "stage1.copies", self.copies,
+                "0, unless --stage1.data is demonstrations")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
 
 

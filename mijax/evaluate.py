@@ -1,4 +1,8 @@
-"""`python -m mijax.evaluate RUN`: greedy episodes of a finished or running run's newest checkpoints."""
+"""`python -m mijax.evaluate RUN`: greedy episodes of a finished or running run's newest checkpoints.
+
+`python -m mijax.evaluate --planner --domain block_pulling` plays a robot task's scripted expert, `--random` random
+actions.
+"""
 
 import dataclasses
 import functools
@@ -15,7 +19,7 @@ from envs_mjx import registry
 from envs_mjx.base import Environment, EnvState
 from envs_mjx.grid import draw
 from envs_mjx.grid.optimal import optimum
-from mijax import checkpoint, runtime, stage1
+from mijax import checkpoint, evaluate_robot, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
 from mijax.learner import Learner, LearnerState, make_learner
@@ -32,16 +36,31 @@ COLUMNS = ("success", "return", "discounted_return", "of_optimum", "length", "re
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateOptions:
-    """Play a run's newest checkpoint greedily: success, returns, length, how often information was asked for."""
+    """Play a run's newest checkpoint greedily: success, returns, length, how often information was asked for.
 
-    run: tyro.conf.Positional[pathlib.Path]
+    With --planner or --random no run is played but a robot task's scripted expert, or random actions.
+    """
+
+    run: tyro.conf.Positional[pathlib.Path | None] = None
     """Run folder, of a run that has finished or is still at work."""
+    planner: bool = False
+    """Play the scripted expert of --domain."""
+    random: bool = False
+    """Play random actions in --domain."""
+    domain: str | None = None
+    """The robot task of --planner and --random: block_pulling, block_pushing or drawer_opening."""
     episodes: int = 500
     """Episodes per seed."""
     seeds: str | None = None
     """Which seeds (0,1; a single one with a comma: 3,) or the first so many (2); default all of the run's."""
     gif: bool = False
-    """Write an episode of each seed as RUN/seed_K/episode.gif."""
+    """Write an episode of each seed as RUN/seed_K/episode.gif, or one of --planner as OUT/planner.gif."""
+    html: bool = False
+    """Write an episode of --planner as OUT/planner.html, a page that needs no network (once: `make viewer`)."""
+    viewer_libraries: pathlib.Path = pathlib.Path(".cache/viewer/node_modules")
+    """Node modules that the page is made with: three and lil-gui."""
+    out: pathlib.Path | None = None
+    """Folder for the pictures of --planner; default runs/DOMAIN-planner."""
     text: bool = False
     """Print an episode of each seed, step by step."""
 
@@ -121,9 +140,36 @@ def show(env: Environment, states: Sequence[EnvState], title: str, gif: pathlib.
         print(f"{title}: {gif}")
 
 
-def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]]:
-    """Evaluate the seeds that were asked for; results by seed."""
+def check(options: EvaluateOptions) -> None:
+    """Raise `ConfigError` for options that do not go together, before any work."""
     require(options.episodes >= 1, "episodes", options.episodes, "a number >= 1")
+    require(not (options.planner and options.random), "random", True, "--planner or --random, not both")
+    if not (options.planner or options.random):
+        require(options.run is not None, "run", None, "a run folder, or --planner or --random with --domain")
+        for name, given in (("domain", options.domain), ("html", options.html or None), ("out", options.out)):
+            require(given is None, name, str(given), "with --planner only; a run has its own domain and folder")
+        return
+    policy = "planner" if options.planner else "random"
+    require(options.run is None, policy, str(options.run), f"no run folder beside --{policy}")
+    require(options.domain is not None, policy, True, f"with --domain, one of {evaluate_robot.DEMONSTRATED}")
+    require(options.seeds is None and not options.text, "seeds" if options.seeds else "text", options.seeds or True,
+            f"with a run only, not with --{policy}")
+    require(options.planner or not (options.gif or options.html or options.out), "random", True,
+            "without --gif, --html and --out: pictures are of --planner")
+
+
+def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
+    """Evaluate the seeds that were asked for: results by seed. None with --planner and --random."""
+    check(options)
+    if options.domain is not None and options.random:
+        evaluate_robot.evaluate_random(options.domain, options.episodes, print)
+        return None
+    if options.domain is not None:
+        out = options.out or pathlib.Path("runs") / f"{options.domain.replace(':', '.')}-planner"
+        libraries = options.viewer_libraries if options.html else None
+        evaluate_robot.evaluate_planner(options.domain, options.episodes, out, options.gif, libraries, print)
+        return None
+    assert options.run is not None
     run = RunFolder.open(options.run)
     config, present = config_of(run), run.seeds()
     seeds = present if options.seeds is None else parse_seeds(options.seeds)

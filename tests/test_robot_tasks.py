@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 import configs
+from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.robot import BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
-from envs_mjx.robot.planner import PLANS, Planner, Trajectory, demonstrations
+from envs_mjx.robot.planner import PLANS, Planner, Trajectory
 from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, SUCCESS, TIME_LIMIT, RobotState, RobotTask
+from mijax.demonstrations import demonstrate
 
 DOMAINS = configs.ROBOTS
 
@@ -66,13 +68,15 @@ def largest_object_error(env: RobotTask, trajectory: Trajectory, places: np.ndar
 
 
 @pytest.mark.parametrize("domain", DOMAINS)
-def test_presets_are_table_3(domain: str) -> None:
-    stage1 = configs.preset(domain).stage1
+def test_the_papers_preset_is_table_3(domain: str) -> None:
+    stage1 = paper(configs.preset(domain), vector_observation=False).stage1
     got = (stage1.lambda_r, stage1.lambda_s, stage1.lambda_o, stage1.lambda_club, stage1.lambda_dim_s,
            stage1.lambda_dim_o, stage1.learning_rate, stage1.episodes, stage1.epochs, stage1.batch_size)
     weights = {"block_pulling": (10.0, 0.1, 1.0, 10.0, 0.1), "block_pushing": (100.0, 1.0, 1.0, 0.001, 0.01),
                "drawer_opening": (100.0, 1.0, 1.0, 1.0, 0.001)}
     assert got == (*weights[domain], 1.0, 0.001, 80, 1000, 500)
+    copies = {"block_pulling": 4, "block_pushing": 12, "drawer_opening": 6}
+    assert (stage1.data, stage1.copies) == ("demonstrations", copies[domain])
     assert configs.preset(domain).domain == domain
 
 
@@ -270,8 +274,8 @@ def test_changing_over() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_eighty_demonstrations_from_one_call(domain: str) -> None:
-    demos = jax.jit(lambda key: demonstrations(make(domain), key))(jax.random.key(0))
-    assert demos.actions.shape == (80, 50, 4)
+    demos = demonstrate(make(domain), jax.random.key(0), 80)
+    assert demos.action.shape == (80, 50, 4)
     assert demos.success.all()
 
 

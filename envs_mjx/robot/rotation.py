@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-COPIES = {"block_pulling": 4, "block_pushing": 12, "drawer_opening": 6}
-"""Turned copies of every sample of stage 1 (Table 3)."""
 EPISODE_COPIES = 4
 """Turned copies of every demonstration in the task's replay."""
 

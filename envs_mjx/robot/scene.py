@@ -115,6 +115,8 @@ class Physics:
         """Args: xml: of `scene_xml`; placed: names of the bodies whose pose is an argument of `advance`."""
         self.model: Any = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
         self.placed = tuple(self.model.body(name).id for name in placed)
+        names = [self.model.geom(geom).name for geom in range(self.model.ngeom)]
+        self._fingers = np.array([geom for geom, name in enumerate(names) if name.startswith(("tip", "finger"))])
         with _as_mjx_is_written():
             self._mjx_model = mjx.put_model(self.model)
             self._data = mjx.make_data(self.model)
@@ -122,7 +124,7 @@ class Physics:
     def advance(
         self, poses: jax.Array, qpos: jax.Array, qvel: jax.Array, target: jax.Array,
         solved: Callable[[jax.Array], jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """One environment step: 0.2 s in 10 substeps, or until the task is solved.
 
         Args:
@@ -133,23 +135,30 @@ class Physics:
             solved: (nq,) -> () bool; everything stands still from then on.
 
         Returns:
-            qpos, qvel.
+            qpos, qvel, and () bool whether a finger touched something on the way.
         """
         model, start = self._place(poses), qpos[:4]
 
         def substep(carry: tuple, time: jax.Array) -> tuple[tuple, None]:
-            qpos, qvel, warmstart, over = carry
+            qpos, qvel, warmstart, over, touched = carry
             control = start + (target - start) * jnp.minimum(time / RAMP_SUBSTEPS, 1.0)
             data = self._data.replace(qpos=qpos, qvel=qvel, ctrl=control, qacc_warmstart=warmstart)
             with _as_mjx_is_written():
                 data = mjx.step(model, data)
+            touched |= ~over & self._touches(data)
             qpos, qvel = (jnp.where(over, old, new) for old, new in ((qpos, data.qpos), (qvel, data.qvel)))
-            return (qpos, qvel, data.qacc_warmstart, over | solved(qpos)), None
+            return (qpos, qvel, data.qacc_warmstart, over | solved(qpos), touched), None
 
-        first = (qpos, qvel, jnp.zeros_like(qvel), solved(qpos))
+        first = (qpos, qvel, jnp.zeros_like(qvel), solved(qpos), jnp.zeros((), bool))
         times = jnp.arange(1, SUBSTEPS + 1, dtype=jnp.float32)
-        (qpos, qvel, _, _), _ = jax.lax.scan(substep, first, times)
-        return qpos, qvel
+        (qpos, qvel, _, _, touched), _ = jax.lax.scan(substep, first, times)
+        return qpos, qvel, touched
+
+    def _touches(self, data: Any) -> jax.Array:
+        """() bool: whether a finger is in contact."""
+        contact = data._impl.contact
+        own = (contact.geom[:, :, None] == self._fingers[None, None]).any(axis=(1, 2))
+        return (own & (contact.dist <= 0)).any()
 
     def _place(self, poses: jax.Array) -> Any:
         bodies = np.array(self.placed)

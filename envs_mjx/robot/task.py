@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.base import ArraySpec, ContinuousActions, Environment, TimeStep, Variable
-from envs_mjx.robot import depth, noise, scene
+from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, TimeStep, Variable
+from envs_mjx.robot import depth, noise, rotation, scene
 
 OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit")
 """What `RobotState.outcome` counts."""
@@ -28,6 +28,7 @@ class RobotState:
     qvel: jax.Array  # (nv,) their velocities
     poses: jax.Array  # (2, 3) x, y, yaw of both objects after the reset
     goal: jax.Array  # (2,) x, y of the goal pad; zeros in a task without one
+    touched: jax.Array  # () bool, whether a finger has touched an object since the reset
     movable: jax.Array  # () int32, the hidden variable: which of the two objects can be moved
     time: jax.Array  # () int32, steps since the reset
     outcome: jax.Array  # () int32, an index into `OUTCOMES`
@@ -48,8 +49,7 @@ class RobotTask(Environment):
     observation_spec = state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
     opening: scene.Opening
     variables = (Variable("movable", hidden=True, num_values=2),
-                 *(Variable(name, hidden=False) for name in (
-                     "height", "turn", "object 0 x", "object 0 y", "object 1 x", "object 1 y")))
+                 *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 
     def __init__(self, noise: float = 0.0) -> None:
         """Args: noise: amplitude of the Perlin noise in the depth image, in metres (paper Appendix E.2: 0.007)."""
@@ -87,6 +87,10 @@ class RobotTask(Environment):
     def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Heights of the movable object, of the immovable one, and of the ground, each (84, 84)."""
 
+    @abc.abstractmethod
+    def turn(self, env_state: RobotState, angle: jax.Array) -> RobotState:
+        """The whole scene turned by `angle` () about the middle of the workspace; `turn_common` does what all share."""
+
     def left_workspace(self, env_state: RobotState) -> jax.Array:
         """() bool: whether the movable object is out of reach. Default: it cannot be."""
         del env_state
@@ -99,18 +103,20 @@ class RobotTask(Environment):
         movable = jax.random.bernoulli(key_movable).astype(jnp.int32)
         qpos = jnp.concatenate([jnp.asarray(scene.START), self.joints(poses[movable])])
         zero = jnp.zeros((), jnp.int32)
-        env_state = RobotState(qpos, jnp.zeros_like(qpos), poses, goal, movable, zero, zero, _noise_key(key_noise))
+        env_state = RobotState(
+            qpos=qpos, qvel=jnp.zeros_like(qpos), poses=poses, goal=goal, touched=jnp.zeros((), bool), movable=movable,
+            time=zero, outcome=zero, noise_key=_noise_key(key_noise))
         return env_state, self.show(env_state)
 
     def step(self, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, TimeStep]:
         """Move the gripper for 0.2 s. The dynamics are deterministic: the key serves the image's noise."""
-        qpos, qvel = self.physics.advance(
+        qpos, qvel, touched = self.physics.advance(
             self.placed_poses(env_state), env_state.qpos, env_state.qvel, scene.target_of(env_state.qpos, action),
             lambda qpos: self.solved(dataclasses.replace(env_state, qpos=qpos)))
         finite = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
         moved = dataclasses.replace(
             env_state, qpos=jnp.where(finite, qpos, env_state.qpos), qvel=jnp.where(finite, qvel, env_state.qvel),
-            time=env_state.time + 1, noise_key=_noise_key(key))
+            touched=env_state.touched | touched, time=env_state.time + 1, noise_key=_noise_key(key))
         conditions = (~finite, self.solved(moved), self.left_workspace(moved), moved.time >= self.horizon)
         outcome = jnp.int32(RUNNING)
         for condition, code in reversed(tuple(zip(conditions, (NOT_FINITE, SUCCESS, LEFT, TIME_LIMIT), strict=True))):
@@ -141,11 +147,63 @@ class RobotTask(Environment):
         masked = depth.depth(without, env_state.qpos[2], painted)
         return jnp.stack([seen, jnp.zeros_like(seen)], axis=-1), jnp.stack([seen, masked], axis=-1)
 
+    def demonstrations(self, key: jax.Array, number: int) -> Demonstrations:
+        """`number` episodes of the scripted expert (Appendix C.1), the successful ones of a few more first."""
+        from envs_mjx.robot import planner  # it builds on this module
+
+        episodes = planner.demonstrations(self, key, number)
+        return Demonstrations(episodes.states, episodes.actions, episodes.length, episodes.success)
+
+    def augment(self, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, jax.Array]:
+        """The scene and the action turned by a random angle (Appendix F), the noise in the image drawn anew.
+
+        The scene is turned and rendered again, not its image: exact, where turning pixels smooths edges, invents what
+        lies beyond the border and turns the painted fingers and the pad, which stay upright in real observations.
+        """
+        key_angle, key_noise = jax.random.split(key)
+        angle = rotation.random_angle(key_angle)
+        turned = self.turn(env_state, angle)
+        noise_key = turned.noise_key ^ _noise_key(key_noise)
+        return dataclasses.replace(turned, noise_key=noise_key), rotation.rotate_action(action, angle)
+
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(7,) float32: which object is movable; the gripper's height and yaw; both objects relative to the gripper."""
-        movable = env_state.movable.astype(jnp.float32)
+        """(4,) float32: which object is movable; the gripper's height; where the nearer object is from the gripper.
+
+        The other object is often out of view.
+        """
         offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
-        return jnp.concatenate([movable[None], env_state.qpos[2:4], offsets.reshape(-1)])
+        nearer = offsets[jnp.argmin(jnp.sum(jnp.square(offsets), axis=1))]
+        return jnp.concatenate([env_state.movable.astype(jnp.float32)[None], env_state.qpos[2:3], nearer])
+
+    def reveals(self, env_state: RobotState) -> jax.Array:
+        """() bool: whether an object has been touched, from when on what is seen can tell which one moves."""
+        return env_state.touched
+
+
+def turn_common(env_state: RobotState, angle: jax.Array) -> RobotState:
+    """Gripper, poses and goal turned by `angle` () about the middle of the workspace; the objects' joints stay."""
+    gripper = turn_poses(env_state.qpos[jnp.array([0, 1, 3])], angle)
+    qpos = env_state.qpos.at[:2].set(gripper[:2]).at[3].set(gripper[2])
+    qvel = env_state.qvel.at[:2].set(turn_vectors(env_state.qvel[:2], angle))
+    return dataclasses.replace(env_state, qpos=qpos, qvel=qvel, poses=turn_poses(env_state.poses, angle),
+                               goal=turn_places(env_state.goal, angle))
+
+
+def turn_poses(poses: jax.Array, angle: jax.Array) -> jax.Array:
+    """(..., 3) x, y, yaw turned by `angle` () about the middle of the workspace."""
+    return jnp.concatenate([turn_places(poses[..., :2], angle), poses[..., 2:] + angle], axis=-1)
+
+
+def turn_places(places: jax.Array, angle: jax.Array) -> jax.Array:
+    """(..., 2) x, y turned by `angle` () about the middle of the workspace."""
+    centre = jnp.broadcast_to(jnp.asarray(scene.CENTRE), places.shape)
+    return turn_vectors(places - centre, angle) + centre
+
+
+def turn_vectors(vectors: jax.Array, angle: jax.Array) -> jax.Array:
+    """(..., 2) x, y turned by `angle` ()."""
+    cos, sin, x, y = jnp.cos(angle), jnp.sin(angle), vectors[..., 0], vectors[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _noise_key(key: jax.Array) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Transitions (s, o, a, r, s', o') of a random policy, stored as indices into the distinct states and observations.
+"""Transitions (s, o, a, r, s', o') of a random policy or an expert, as indices into distinct states and observations.
 
 Letters: N transitions, S distinct states, D distinct observations, V ground-truth variables.
 """
@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.base import ActionSpec, DiscreteActions, Environment
+from envs_mjx.base import ActionSpec, DiscreteActions, Environment, EnvState, TimeStep
+from mijax.config import DataSource
+from mijax.demonstrations import demonstrate
 
 
 @struct.dataclass
@@ -30,6 +32,7 @@ class Transitions:
     ground_truth: jax.Array  # (N, V) float32  `Environment.variables` before the action
     reveals: jax.Array  # (N,) bool  whether `observation` shows what is otherwise hidden
     episode: jax.Array  # (N,) int32
+    moments: EnvState | None = None  # leaves (S, ...)  what shows each state, to be augmented; None: not kept
 
     @property
     def size(self) -> int:
@@ -144,6 +147,36 @@ def tabulate(transitions: Transitions) -> tuple[TransitionTable, jax.Array]:
     return jax.tree.map(lambda c: c[first], columns), jnp.asarray(inverse.reshape(-1), jnp.int32)
 
 
-def collect(env: Environment, key: jax.Array, num_episodes: int) -> Transitions:
-    """The transitions of `num_episodes` episodes of the random policy (Appendix C.1)."""
+def collect(env: Environment, key: jax.Array, num_episodes: int, source: DataSource = "random") -> Transitions:
+    """The transitions of `num_episodes` episodes of the random policy or of the environment's expert (Appendix C.1).
+
+    Raises:
+        ConfigError: demonstrations are asked of an environment without an expert.
+    """
+    if source == "demonstrations":
+        return demonstrated(env, key, num_episodes)
     return flatten(random_episodes(env, key, num_episodes))
+
+
+def demonstrated(env: Environment, key: jax.Array, num_episodes: int) -> Transitions:
+    """The transitions of an expert's episodes. Every moment counts as distinct, and is kept beside its frames."""
+    episodes = jax.device_get(demonstrate(env, key, num_episodes))
+    horizon = episodes.action.shape[1]
+    row, step = np.nonzero(np.arange(horizon) < episodes.length[:, None])
+    seen = np.arange(horizon + 1) <= episodes.length[:, None]
+    index = np.cumsum(seen).reshape(seen.shape).astype(np.int32) - 1
+    now, after = index[row, step], index[row, step + 1]
+    moments = jax.tree.map(lambda leaf: jnp.asarray(leaf[seen]), episodes.env_state)
+    shown, truth, reveals = _look(env, moments)
+    return Transitions(
+        states=shown.state, observations=shown.observation, state=jnp.asarray(now), observation=jnp.asarray(now),
+        action=jnp.asarray(episodes.action[row, step]), reward=shown.reward[after], next_state=jnp.asarray(after),
+        next_observation=jnp.asarray(after), terminal=shown.terminated[after], ground_truth=truth[now],
+        reveals=reveals[now], episode=jnp.asarray(row, jnp.int32), moments=moments)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _look(env: Environment, moments: EnvState) -> tuple[TimeStep, jax.Array, jax.Array]:
+    """What each of (S, ...) moments shows, its ground truth, and whether it reveals what is hidden."""
+    look = lambda moment: (env.show(moment), env.ground_truth(moment), env.reveals(moment))  # noqa: E731
+    return jax.lax.map(look, moments)

@@ -123,7 +123,7 @@ def probe(
     representation: Representation, env: Environment, config: Stage1Config, key: jax.Array,
     history: History | None = None
 ) -> ProbeReport:
-    """Test a representation on `config.heldout_episodes` episodes of the random policy, drawn with `key`.
+    """Test a representation on `config.heldout_episodes` episodes like those of training, drawn with `key`.
 
     Args:
         representation: the encoders.
@@ -133,7 +133,7 @@ def probe(
         history: what training left, for the errors of the dynamics model; None leaves them out.
     """
     data_key, mlp_key = jax.random.split(key)
-    return probe_on(collect(env, data_key, config.heldout_episodes), representation, env, mlp_key, history)
+    return probe_on(collect(env, data_key, config.heldout_episodes, config.data), representation, env, mlp_key, history)
 
 
 def probe_on(

@@ -141,9 +141,10 @@ def search(
     largest = {name: max(getattr(c, name) for c in configs) for name in ("lambda_dim_s", "lambda_dim_o")}
     first_key = next(iter(keys.values()))
     data_key, _, train_key = jax.random.split(first_key, 3)
-    problem = Problem.of(env, dataclasses.replace(config, **largest), collect(env, data_key, config.episodes))
+    data = collect(env, data_key, config.episodes, config.data)
+    problem = Problem.of(env, dataclasses.replace(config, **largest), data)
     heldout_key, probe_key = jax.random.split(jax.random.fold_in(first_key, 1))
-    heldout = collect(env, heldout_key, config.heldout_episodes)
+    heldout = collect(env, heldout_key, config.heldout_episodes, config.data)
     init_keys = jnp.stack([jax.random.split(key, 3)[1] for key in keys.values()])
     group = _Group(
         list(range(len(configs))), _stack([LossWeights.of(c) for c in configs for _ in keys]),

@@ -41,6 +41,8 @@ class DivergenceError(RuntimeError):
     """A loss became infinite or not a number; the message names it."""
 
 
+MANY_VALUES = 2**24
+"""In frames that are encoded at once."""
 CONSTANT = 1e-10
 """A variance of z_s below this is the rounding of its mean."""
 Weight = jax.Array | float
@@ -97,12 +99,23 @@ class TrainState:
 
 
 @struct.dataclass
+class Shown:
+    """Frames of a batch's own, one row each."""
+
+    state: jax.Array  # (B', *state_shape)
+    observation: jax.Array  # (B', *observation_shape)
+    next_state: jax.Array  # (B', *state_shape)
+    next_observation: jax.Array  # (B', *observation_shape)
+
+
+@struct.dataclass
 class Batch:
     """Distinct transitions of a batch, B' of them."""
 
     rows: TransitionTable  # (B',) each
     weight: jax.Array  # (B',) float32, probability of each row in the batch; sums to one
     reward_weight: jax.Array  # (B',) float32, the same for the reward loss
+    shown: "Shown | None"  # augmented frames; None: those of the data set, at the rows' indices
     noise: jax.Array | None  # (B', F) standard normal, added to z_s; None but under the KL penalty
 
 
@@ -137,6 +150,7 @@ class Problem:
     Of the loss weights, `config` has Believer's and tells which losses take part; `LossWeights` has the values.
     """
 
+    env: Environment
     networks: Networks
     config: Stage1Config
     data: Transitions
@@ -160,27 +174,52 @@ class Problem:
         networks, (table, row) = networks_for(env, config.features), tabulate(data)
         rewards, count = np.unique(data.reward, return_counts=True)
         rewarded = np.flatnonzero(table.reward != rewards[np.argmax(count)]).astype(np.int32)
-        return cls(networks, config, data, table, row, prepared(networks.phi, data.states),
+        return cls(env, networks, config, data, table, row, prepared(networks.phi, data.states),
                    prepared(networks.psi, data.observations), jnp.asarray(rewarded))
+
+    @property
+    def size(self) -> int:
+        """Transitions, copies included: number c N + i is copy c of transition i, copy 0 the original."""
+        return self.data.size * (1 + self.config.copies)
 
     @property
     def updates_per_epoch(self) -> int:
         """Whole batches in the data set."""
-        return self.data.size // self.config.batch_size
+        return self.size // self.config.batch_size
 
     def batch(self, chosen: jax.Array, key: jax.Array) -> Batch:
         """The batch of (B,) chosen transitions, with the rewarded ones and the noise that `key` draws."""
-        rows, weight, reward_weight = self._rows(chosen, key)
-        noise = None
+        rows, weight, reward_weight = self._rows(chosen % self.data.size, key)
+        shown = noise = None
+        if self.config.copies > 0:
+            copy = jnp.pad(chosen >= self.data.size, (0, rows.size - chosen.size), constant_values=True)
+            rows, shown = self._augment(rows, copy, jax.random.fold_in(key, 2))
         if self.config.lambda_kl > 0:
             noise = jax.random.normal(jax.random.fold_in(key, 1), (rows.size, self.config.features))
-        return Batch(rows, weight, reward_weight, noise)
+        return Batch(rows, weight, reward_weight, shown, noise)
+
+    def _augment(self, rows: TransitionTable, copy: jax.Array, key: jax.Array) -> tuple[TransitionTable, Shown]:
+        """Frames and actions of (B',) rows, each moved by a symmetry of its own where `copy`."""
+
+        def look(row: tuple) -> tuple[jax.Array, Shown]:
+            now, after, action, copy, key = row
+            moved = [self.env.augment(key, jax.tree.map(lambda x, i=i: x[i], self.data.moments), action)
+                     for i in (now, after)]
+            moments = [jax.tree.map(lambda x, m, i=i: jnp.where(copy, m, x[i]), self.data.moments, m)
+                       for i, (m, _) in zip((now, after), moved, strict=True)]
+            now, after = (self.env.show(moment) for moment in moments)
+            return jnp.where(copy, moved[0][1], action), Shown(
+                now.state, now.observation, after.state, after.observation)
+
+        keys = jax.random.split(key, rows.size)
+        action, shown = jax.vmap(look)((rows.state, rows.next_state, rows.action, copy, keys))
+        return dataclasses.replace(rows, action=action), shown
 
     def _rows(self, chosen: jax.Array, key: jax.Array) -> tuple[TransitionTable, jax.Array, jax.Array]:
         rows, size = self.row[chosen], self.config.batch_size
         extra = self.config.rewarded if self.rewarded.size else 0
         added = self.rewarded[jax.random.randint(key, (extra,), 0, self.rewarded.size)] if extra else rows[:0]
-        if self.table.size <= size:
+        if self.table.size <= size and self.config.copies == 0:
             nothing = jnp.zeros(self.table.size, jnp.float32)
             table, weight, drawn = self.table, nothing.at[rows].add(1 / size), nothing.at[added].add(1.0)
         else:
@@ -264,29 +303,36 @@ def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
     return centered * jax.lax.rsqrt(variance + STANDARDIZE_FLOOR * jnp.mean(variance) + 1e-12)[None]
 
 
-def features(problem: Problem, parameters: dict[str, Params], rows: TransitionTable) -> Features:
+def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> Features:
     """z_s, z_o, their successors (constants), and what the discriminators say of the inputs: (B, F) each."""
-    networks, config = problem.networks, problem.config
+    networks, config, rows, shown = problem.networks, problem.config, batch.rows, batch.shown
+    each = jnp.arange(rows.size, dtype=jnp.int32)
 
-    def both(encoder: Encoder, frames: Frames, index: jax.Array, next_index: jax.Array, name: str,
+    def both(encoder: Encoder, now: tuple[Frames, jax.Array], after: tuple[Frames, jax.Array], name: str,
              discriminator: str | None) -> tuple[jax.Array, jax.Array, jax.Array | None]:
         weights = parameters[name]
         frozen = jax.lax.stop_gradient(weights)
 
-        def now(x: Frames) -> jax.Array:
+        def see(x: Frames) -> jax.Array:
             z = evaluate(encoder, weights, x)
             if discriminator is None:
                 return z
             return jnp.concatenate([z, local_features(encoder, weights, parameters[discriminator], x)], axis=-1)
 
-        z, *local = jnp.split(encode(now, frames, index), 1 if discriminator is None else 2, axis=-1)
-        next_z = encode(lambda x: evaluate(encoder, frozen, x), frames, next_index)
+        z, *local = jnp.split(encode(see, *now), 1 if discriminator is None else 2, axis=-1)
+        next_z = encode(lambda x: evaluate(encoder, frozen, x), *after)
         return z, next_z, local[0] if local else None
 
-    z_s, next_z_s, local_s = both(networks.phi, problem.states, rows.state, rows.next_state, "phi",
-                                  "discriminator_s" if config.lambda_dim_s > 0 else None)
-    z_o, next_z_o, local_o = both(networks.psi, problem.observations, rows.observation, rows.next_observation, "psi",
-                                  "discriminator_o" if config.lambda_dim_o > 0 else None)
+    if shown is None:
+        s, next_s = (problem.states, rows.state), (problem.states, rows.next_state)
+        o, next_o = (problem.observations, rows.observation), (problem.observations, rows.next_observation)
+    else:
+        s, next_s = (shown.state, each), (shown.next_state, each)
+        o, next_o = (shown.observation, each), (shown.next_observation, each)
+    z_s, next_z_s, local_s = both(
+        networks.phi, s, next_s, "phi", "discriminator_s" if config.lambda_dim_s > 0 else None)
+    z_o, next_z_o, local_o = both(
+        networks.psi, o, next_o, "psi", "discriminator_o" if config.lambda_dim_o > 0 else None)
     return Features(z_s=z_s, z_o=z_o, next_z_s=next_z_s, next_z_o=next_z_o, local_s=local_s, local_o=local_o)
 
 
@@ -305,7 +351,7 @@ def encoder_loss(
         The loss, and the estimator with the terms of the loss.
     """
     networks, rows, weight = problem.networks, batch.rows, batch.weight
-    f = features(problem, parameters, rows)
+    f = features(problem, parameters, batch)
     mean_z_s = f.z_s
     if batch.noise is not None:
         f = dataclasses.replace(f, z_s=mean_z_s + batch.noise)
@@ -321,10 +367,13 @@ def encoder_loss(
     }
     if batch.noise is not None:
         terms["kl"] = problem.config.lambda_kl, weight @ kl_standard_normal(mean_z_s, jnp.zeros_like(mean_z_s))
+    # Two turned copies never show the same: then only a frame itself is its positive.
+    each = jnp.arange(rows.size, dtype=jnp.int32)
+    s, o = (rows.state, rows.observation) if batch.shown is None else (each, each)
     if f.local_s is not None:
-        terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, rows.state, weight)
+        terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, s, weight)
     if f.local_o is not None:
-        terms["dim_o_loss"] = weights.lambda_dim_o, dim_loss(f.z_o, f.local_o, rows.observation, weight)
+        terms["dim_o_loss"] = weights.lambda_dim_o, dim_loss(f.z_o, f.local_o, o, weight)
     total = sum((scale * value for scale, value in terms.values()), jnp.zeros((), jnp.float32))
     return total, (fit, {"loss": total} | {name: value for name, (_, value) in terms.items()})
 
@@ -375,7 +424,7 @@ def make_epoch(problem: Problem) -> Epoch:
             parameters = cast(dict[str, Params], optax.apply_updates(state.parameters, step))
             return TrainState(parameters, optimizer_state, fit), metrics
 
-        order = jax.random.permutation(key, problem.data.size)[: updates * config.batch_size]
+        order = jax.random.permutation(key, problem.size)[: updates * config.batch_size]
         draws = order.reshape(updates, config.batch_size), jax.random.split(jax.random.fold_in(key, 1), updates)
         state, metrics = jax.lax.scan(update, state, draws)
         return state, jax.tree.map(lambda value: value[-1], metrics)
@@ -395,7 +444,7 @@ def learn_representation(
         ConfigError: the data set is smaller than one batch.
     """
     data_key, init_key, train_key = jax.random.split(key, 3)
-    return train_on(collect(env, data_key, config.episodes), env, config, init_key, train_key, on_progress)
+    return train_on(collect(env, data_key, config.episodes, config.data), env, config, init_key, train_key, on_progress)
 
 
 def train_on(
@@ -449,5 +498,7 @@ def representation_of(problem: Problem, state: TrainState) -> Representation:
 
 @functools.partial(jax.jit, static_argnums=0)
 def encode_frames(encoder: Encoder, parameters: Params, frames: jax.Array) -> jax.Array:
-    """(M, F) features of (M, ...) frames."""
-    return evaluate(encoder, parameters, frames)
+    """(M, F) features of (M, ...) frames; of large images only some at a time, since patches of all fill the memory."""
+    if frames.size <= MANY_VALUES:
+        return evaluate(encoder, parameters, frames)
+    return jax.lax.map(lambda frame: evaluate(encoder, parameters, frame), frames, batch_size=64)

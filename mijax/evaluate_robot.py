@@ -1,0 +1,101 @@
+"""`python -m mijax.evaluate --planner` and `--random`: a robot task's expert, or random actions, measured."""
+
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+import configs
+from envs_mjx import registry
+from envs_mjx.base import Environment, EnvState
+from envs_mjx.grid import draw
+from mijax.config import require
+from mijax.metrics import RunError
+
+if TYPE_CHECKING:
+    from envs_mjx.robot.trial import Trial
+
+EPISODE_FILE, PAGE_FILE = "planner.gif", "planner.html"
+DEMONSTRATED = ", ".join(configs.ROBOTS)
+
+
+def robot(option: str, domain: str) -> Environment:
+    """The robot task of that name; `ConfigError` for a domain without a planner, before any work."""
+    env = registry.make(domain)
+    has_expert = type(env).demonstrations is not Environment.demonstrations
+    require(has_expert and hasattr(env, "physics"), "domain", domain, f"with --{option} a robot task: {DEMONSTRATED}")
+    return env
+
+
+def evaluate_planner(
+    domain: str, episodes: int, out: pathlib.Path, gif: bool, libraries: pathlib.Path | None, say: Callable[[str], None]
+) -> "Trial":
+    """Play the scripted expert, half of the episodes with the immovable object first; say what came of it.
+
+    Args:
+        domain: a robot task.
+        episodes: how many.
+        out: folder for the pictures.
+        gif: whether to write an episode as `out`/planner.gif.
+        libraries: node modules for `out`/planner.html; None: no page.
+        say: prints a line.
+    """
+    env = robot("planner", domain)
+    from envs_mjx.robot import page, trial  # MuJoCo is imported with the task only
+
+    try:
+        scripts = None if libraries is None else page.load_scripts(libraries)
+    except page.ViewerMissing as error:
+        raise RunError(str(error)) from None
+    started = time.perf_counter()
+    played = trial.expert_trial(env, jax.random.key(0), episodes)  # pyright: ignore[reportArgumentType]
+    say(f"{domain}: {episodes} episodes of the scripted expert in {time.perf_counter() - started:.0f} s")
+    assert played.movable_first is not None
+    say(f"{'works first on':<22}{'episodes':>9}{'success':>9}{'mean length':>13}{'median':>8}")
+    for name, rows in (("the immovable object", ~played.movable_first), ("the movable object", played.movable_first),
+                       ("either", np.ones(episodes, bool))):
+        if rows.any():
+            length = played.length[rows]
+            say(f"{name:<22}{rows.sum():>9}{played.success[rows].mean():>9.3f}{length.mean():>13.1f}"
+                f"{np.median(length):>8.0f}")
+    say(_endings(played))
+    moments = played.episode(int(np.argmax(played.success & ~played.movable_first)))
+    if gif or scripts is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    if scripts is not None:
+        (out / PAGE_FILE).write_text(page.page(env, moments, scripts))  # pyright: ignore[reportArgumentType]
+        say(f"an episode that begins with the immovable object: {out / PAGE_FILE}")
+    if gif:
+        _save_gif(env, moments, out, say)
+    return played
+
+
+def evaluate_random(domain: str, episodes: int, say: Callable[[str], None]) -> "Trial":
+    """Play uniformly random actions; say how the episodes ended and whether anything shown was not finite."""
+    env = robot("random", domain)
+    from envs_mjx.robot import trial
+
+    started = time.perf_counter()
+    played = trial.random_trial(env, jax.random.key(0), episodes)  # pyright: ignore[reportArgumentType]
+    say(f"{domain}: {episodes} episodes of random actions in {time.perf_counter() - started:.0f} s, "
+        f"mean length {played.length.mean():.1f}")
+    say(_endings(played))
+    say(f"frames shown with a number that is not finite: {played.not_finite}")
+    return played
+
+
+def _endings(played: "Trial") -> str:
+    return "endings: " + ", ".join(f"{name} {count}" for name, count in played.counts().items())
+
+
+def _save_gif(env: Environment, moments: Sequence[EnvState], out: pathlib.Path, say: Callable[[str], None]) -> None:
+    from envs_mjx.robot import film
+
+    pictures = film.rendered(env, moments)  # pyright: ignore[reportArgumentType]
+    if pictures is None:
+        say("no OpenGL without a display (EGL or OSMesa): the pictures show depth and state, and no rendered view")
+    draw.save_gif(out / EPISODE_FILE, film.frames(env, moments, pictures))  # pyright: ignore[reportArgumentType]
+    say(f"an episode that begins with the immovable object: {out / EPISODE_FILE}")

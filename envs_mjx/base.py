@@ -38,6 +38,19 @@ class TimeStep:
         return self.terminated | self.truncated
 
 
+@struct.dataclass
+class Demonstrations:
+    """N whole episodes of an expert, of at most T = horizon steps; what follows an episode's end is meaningless.
+
+    They hold moments, not images: `Environment.show` gives back what each of them showed.
+    """
+
+    env_state: EnvState  # leaves (N, T + 1, ...)
+    action: jax.Array  # (N, T, ...)  action t leads from moment t to moment t + 1
+    length: jax.Array  # (N,) int32  steps of each episode
+    success: jax.Array  # (N,) bool  whether the episode solved the task
+
+
 @dataclasses.dataclass(frozen=True)
 class ArraySpec:
     """Shape and dtype of an observation or a state. Images are (rows, columns, channels)."""
@@ -129,3 +142,29 @@ class Environment(abc.ABC):
         Learners store and encode listed observations once, however often they are seen.
         """
         return None
+
+    def show(self, env_state: EnvState) -> TimeStep:
+        """What `reset` or `step` showed when it returned `env_state`, so that moments can be stored in place of frames.
+
+        Raises:
+            NotImplementedError: by default. Only environments that have `demonstrations` need it.
+        """
+        del env_state
+        raise NotImplementedError(f"environment {self.name!r} does not show a moment again")
+
+    def demonstrations(self, key: jax.Array, number: int) -> Demonstrations | None:
+        """`number` episodes of an expert, those that solve the task first; None, the default, without an expert.
+
+        A pure function of `key`, to be compiled with `number` fixed.
+        """
+        del key, number
+        return None
+
+    def augment(self, key: jax.Array, env_state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+        """A moment and an action, as they would be in a world that a symmetry of the task has moved.
+
+        `key` draws the symmetry, and nothing else does: with one key for both of its moments a transition stays one,
+        with one key for all of its moments an episode does. Default: the world as it is.
+        """
+        del key
+        return env_state, action

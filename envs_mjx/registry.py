@@ -13,7 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs_mjx.base import ArraySpec, ContinuousActions, DiscreteActions, Environment, EnvState, TimeStep
+from envs_mjx.base import (
+    ArraySpec,
+    ContinuousActions,
+    Demonstrations,
+    DiscreteActions,
+    Environment,
+    EnvState,
+    TimeStep,
+)
 
 Factory = Callable[[], Environment] | str
 """Makes an environment: a callable (a class, say), or "package.module:EnvClass", imported only when it is made."""
@@ -105,13 +113,17 @@ def check_contract(env: Environment, num_steps: int = 3) -> None:
     next_state, later = _evaluate(env, "step", env.step, key, env_state, action)
     for place, timestep in (("reset", first), ("step", later)):
         _check_timestep(env, place, timestep)
-    _check_same_structure(env, env_state, next_state)
+    _check_same_structure(env, "step", env_state, next_state)
     for place, function, expected in (
         ("ground_truth", env.ground_truth, ArraySpec((len(env.variables),))),
         ("reveals", env.reveals, ArraySpec((), bool)),
     ):
         _check_array(env, place, _evaluate(env, place, function, env_state), expected)
     _check_array(env, "success", _evaluate(env, "success", env.success, later), ArraySpec((), bool))
+    moved_state, moved_action = _evaluate(env, "augment", env.augment, key, env_state, action)
+    _check_same_structure(env, "augment", env_state, moved_state)
+    _check_array(env, "action of augment", moved_action, ArraySpec(action.shape, action.dtype))
+    _check_demonstrations(env, key, env_state, action)
     listed = env.all_observations()
     if listed is not None:
         _check_list(env, listed)
@@ -145,15 +157,21 @@ def _check_declarations(env: Environment) -> None:
     _require(env, size >= 1, "the number of actions", size, "at least 1")
 
 
+_PAIRS = {"reset": (TimeStep, "(env_state, TimeStep)"), "step": (TimeStep, "(env_state, TimeStep)"),
+          "augment": (jax.ShapeDtypeStruct, "(env_state, action)")}
+"""Methods that return an `EnvState` and something else: what it is, in eyes of `jax.eval_shape` and of people."""
+
+
 def _evaluate(env: Environment, place: str, function: Callable, *args: object):
     """Shapes and types of what `function` returns."""
     try:
         result = jax.eval_shape(function, *args)
     except Exception as error:  # whatever tracing raises
         raise ContractError(f"environment {env.name!r}: {place} cannot be traced by JAX: {_one_line(error)}") from error
-    if place in ("reset", "step"):
-        good = isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], TimeStep)
-        _require(env, good, f"what {place} returns", type(result).__name__, "(env_state, TimeStep)")
+    if place in _PAIRS:
+        kind, expected = _PAIRS[place]
+        good = isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], kind)
+        _require(env, good, f"what {place} returns", type(result).__name__, expected)
     return result
 
 
@@ -173,12 +191,31 @@ def _check_timestep(env: Environment, place: str, timestep: TimeStep) -> None:
         _check_array(env, f"{field} of {place}", getattr(timestep, field), expected)
 
 
-def _check_same_structure(env: Environment, before: EnvState, after: EnvState) -> None:
+def _check_same_structure(env: Environment, place: str, before: EnvState, after: EnvState, lead: tuple = ()) -> None:
+    """`after` is an abstract EnvState like `before`, with leading axes `lead`."""
     structures = jax.tree.structure(before), jax.tree.structure(after)
-    _require(env, structures[0] == structures[1], "the EnvState of step", str(structures[1]),
+    _require(env, structures[0] == structures[1], f"the EnvState of {place}", str(structures[1]),
              f"the structure that reset returns, {structures[0]}")
     for (path, leaf), other in zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True):
-        _check_array(env, f"EnvState{jax.tree_util.keystr(path)} of step", other, ArraySpec(leaf.shape, leaf.dtype))
+        _check_array(env, f"EnvState{jax.tree_util.keystr(path)} of {place}", other,
+                     ArraySpec((*lead, *leaf.shape), leaf.dtype))
+
+
+def _check_demonstrations(env: Environment, key: jax.Array, env_state: EnvState, action: jax.Array) -> None:
+    """Abstractly: what an environment with an expert has to offer."""
+    number = 2
+    shown = _evaluate(env, "demonstrations", lambda key: env.demonstrations(key, number), key)
+    if shown is None:
+        return
+    _require(env, isinstance(shown, Demonstrations), "what demonstrations returns", type(shown).__name__,
+             "Demonstrations or None")
+    _check_same_structure(env, "demonstrations", env_state, shown.env_state, (number, env.horizon + 1))
+    for name, expected in (
+        ("action", ArraySpec((number, env.horizon, *action.shape), action.dtype)),
+        ("length", ArraySpec((number,), np.int32)), ("success", ArraySpec((number,), bool)),
+    ):
+        _check_array(env, f"{name} of demonstrations", getattr(shown, name), expected)
+    _check_timestep(env, "show", _evaluate(env, "show", env.show, env_state))
 
 
 def _check_list(env: Environment, listed: object) -> None:

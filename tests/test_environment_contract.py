@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from envs_mjx import registry
-from envs_mjx.base import ArraySpec, ContinuousActions, Environment, EnvState, TimeStep
+from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, EnvState, TimeStep
 from envs_mjx.grid import HeavenHell
 from envs_mjx.grid.world import GridState, GridWorld
 
@@ -133,6 +133,15 @@ def test_hidden_variable_is_invisible_off_the_information_cells(episodes: Episod
         assert len(np.unique(at_cell, axis=0)) == num_goals
 
 
+def test_moments_show_what_was_seen(episodes: Episodes) -> None:
+    env = episodes.env
+    if jax.eval_shape(lambda key: env.demonstrations(key, 1), jax.random.key(0)) is None:
+        pytest.skip("the environment has no expert, and need not show moments again")
+    states, timesteps = jax.tree.map(lambda x: x[:4, :6], (episodes.states, episodes.timesteps))
+    shown = jax.jit(jax.vmap(jax.vmap(env.show)))(states)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), shown, timesteps)
+
+
 # The registry
 
 
@@ -216,6 +225,13 @@ def _with(**attributes):
     (_with(step=lambda self, key, env_state, action: (env_state.cell, self.reset(key)[1])), "the EnvState of step"),
     (_with(step=lambda self, key, env_state, action: (
         env_state.replace(time=env_state.time * 1.0), self.reset(key)[1])), r"EnvState.time of step is 'float32\[\]'"),
+    (_with(augment=lambda self, key, env_state, action: env_state), "what augment returns is 'GridState', expected"),
+    (_with(augment=lambda self, key, env_state, action: (env_state, action * 1.0)), "action of augment is 'float32"),
+    (_with(demonstrations=lambda self, key, number: ()), "what demonstrations returns is 'tuple', expected Demonstr"),
+    (_with(demonstrations=lambda self, key, number: Demonstrations(
+        jax.tree.map(lambda x: jnp.zeros((number, 51, *x.shape), x.dtype), self.reset(key)[0]),
+        jnp.zeros((number, 49), jnp.int32), jnp.zeros(number, jnp.int32), jnp.zeros(number, bool))),
+     r"action of demonstrations is 'int32\[2, 49\]', expected int32\[2, 50\]"),
     (_with(step=lambda self, key, env_state, action: 1 if action > 0 else 2), "step cannot be traced by JAX: Tracer"),
 ])
 @pytest.mark.lenient

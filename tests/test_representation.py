@@ -13,6 +13,7 @@ from envs_mjx import registry
 from envs_mjx.base import ArraySpec
 from mijax import represent
 from mijax.config import ConfigError, Stage1Config
+from mijax.demonstrations import demonstrate
 from mijax.nets.encoders import Convolution, encoder_for, image_plan
 from mijax.representation import DivergenceError, encode_observation, encode_state, learn_representation
 from mijax.representation.dataset import Transitions, collect, tabulate
@@ -49,6 +50,11 @@ def test_transitions_follow_one_another_and_end_with_their_episode(data):
     assert np.bincount(episode).max() <= 50
     np.testing.assert_array_equal(np.asarray(data.reward) != 0, terminal)
     assert len(np.unique(np.asarray(data.states), axis=0)) == len(data.states) <= 28
+
+
+def test_a_domain_without_an_expert_is_named():
+    with pytest.raises(ConfigError, match="heaven_hell has no expert"):
+        demonstrate(registry.make("heaven_hell"), jax.random.key(0), 2)
 
 
 def test_the_table_of_distinct_transitions_gives_the_transitions_back(data):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from envs_mjx import registry
-from envs_mjx.robot import BlockPulling, depth, noise
+from envs_mjx.robot import BlockPulling, depth, noise, scene
 from envs_mjx.robot.rotation import rotate_action, rotate_image
 from envs_mjx.robot.task import RobotState, RobotTask
 
@@ -35,22 +35,6 @@ def resets(env: RobotTask, number: int) -> RobotState:
 def moved(env_state: RobotState, gripper) -> RobotState:
     qpos = jnp.asarray(env_state.qpos).at[:4].set(jnp.asarray(gripper, jnp.float32))
     return dataclasses.replace(env_state, qpos=qpos)
-
-
-def turned(env_state: RobotState, angle: float) -> RobotState:
-    """The whole scene, turned about the gripper."""
-    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-    matrix, middle = jnp.array([[cos, -sin], [sin, cos]]), env_state.qpos[:2]
-
-    def about(pose: jax.Array) -> jax.Array:
-        place = matrix @ (pose[:2] - middle) + middle
-        return jnp.concatenate([place, pose[2:] + angle])
-
-    qpos = env_state.qpos.at[3].add(angle)
-    if qpos.shape[0] == 7:
-        qpos = qpos.at[4:].set(about(qpos[4:]))
-    return dataclasses.replace(
-        env_state, qpos=qpos, poses=jax.vmap(about)(env_state.poses), goal=about(env_state.goal))
 
 
 def away_from_edges(height: np.ndarray, pixels: int = 1) -> np.ndarray:
@@ -179,7 +163,7 @@ def test_a_quarter_turn_is_exact(env: RobotTask, quarters: int) -> None:
     """Turning the image is turning the scene, up to pixels whose middle is on an edge."""
     env_state = moved(jax.tree.map(lambda x: x[0], resets(env, 1)), (0.53, 0.02, 0.15, 0.4))
     angle = quarters * np.pi / 2
-    for image, expected in zip(env.render(env_state), env.render(turned(env_state, angle)), strict=True):
+    for image, expected in zip(env.render(env_state), env.render(env.turn(env_state, jnp.float32(angle))), strict=True):
         got = np.asarray(rotate_image(image, jnp.float32(angle)))
         np.testing.assert_allclose(got, np.rot90(image, -quarters, (1, 0)), atol=1e-5)
         assert (np.abs(got - expected) > 1e-5).mean() < 5e-4
@@ -190,13 +174,40 @@ def test_any_turn_is_that_of_the_scene(env: RobotTask, angle: float) -> None:
     """Within the circle that stays in the image, two pixels off edges: the painted fingers do not turn, nor the pad."""
     env_state = moved(jax.tree.map(lambda x: x[0], resets(env, 1)), (0.53, 0.02, 0.15, 0.4))
     got = np.asarray(rotate_image(env.render(env_state)[1], jnp.float32(angle)))
-    expected = np.asarray(env.render(turned(env_state, angle))[1])
+    expected = np.asarray(env.render(env.turn(env_state, jnp.float32(angle)))[1])
     offsets = np.arange(84) - 41.5
     inside = np.hypot(offsets[:, None], offsets[None, :]) < 40
     for channel in (0, 1):
         sure = inside & away_from_edges(got[..., channel], 2) & away_from_edges(expected[..., channel], 2)
         assert sure.sum() > 1500
         np.testing.assert_allclose(got[..., channel][sure], expected[..., channel][sure], atol=1e-4)
+
+
+def test_augmenting_turns_moments_and_actions_alike(env: RobotTask) -> None:
+    """One key, one turn: places and actions by the same angle, and the objects stay sorted as they are drawn."""
+    states = jax.tree.map(lambda x: x[:16], resets(env, 64))
+    action = jnp.array([0.3, 0.4, -0.3, 0.9])
+    keys = jax.random.split(jax.random.key(0), 16)
+    moved_states, actions = jax.vmap(env.augment, (0, 0, None))(keys, states, action)
+    angle = np.asarray(moved_states.qpos[:, 3] - states.qpos[:, 3])
+    assert np.ptp(angle) > 1
+    for index in range(16):
+        np.testing.assert_allclose(actions[index], rotate_action(action, jnp.float32(angle[index])), atol=1e-6)
+    cos, sin = np.cos(angle), np.sin(angle)
+    matrix = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
+    loose, loose_moved = (np.take_along_axis(np.asarray(s.poses), np.asarray(s.movable)[:, None, None], axis=1)[:, 0]
+                          for s in (states, moved_states))
+    middle = scene.CENTRE[None]
+    expected = np.einsum("nij,nj->ni", matrix, loose[:, :2] - middle) + middle
+    np.testing.assert_allclose(loose_moved[:, :2], expected, atol=1e-6)
+    np.testing.assert_allclose(loose_moved[:, 2], loose[:, 2] + angle, atol=1e-6)
+    if env.name == "drawer_opening":
+        np.testing.assert_array_equal(moved_states.movable, states.movable)
+    else:
+        np.testing.assert_array_equal(moved_states.qpos[:, 4:], loose_moved)
+        assert (np.diff(moved_states.poses[:, :, 1], axis=1) >= 0).all()
+        assert (np.asarray(moved_states.movable) != states.movable).any()
+    assert (np.asarray(moved_states.noise_key) != states.noise_key).any()
 
 
 def test_turned_actions() -> None:

@@ -13,8 +13,9 @@ import configs
 from envs_mjx import registry
 from envs_mjx.robot import BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
-from envs_mjx.robot.planner import PLANS, Planner, Trajectory, demonstrations
+from envs_mjx.robot.planner import PLANS, Planner, Trajectory
 from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, SUCCESS, TIME_LIMIT, RobotState, RobotTask
+from mijax.demonstrations import demonstrate
 
 DOMAINS = configs.ROBOTS
 
@@ -270,8 +271,8 @@ def test_changing_over() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_eighty_demonstrations_from_one_call(domain: str) -> None:
-    demos = jax.jit(lambda key: demonstrations(make(domain), key))(jax.random.key(0))
-    assert demos.actions.shape == (80, 50, 4)
+    demos = demonstrate(make(domain), jax.random.key(0), 80)
+    assert demos.action.shape == (80, 50, 4)
     assert demos.success.all()
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.robot import depth, scene
-from envs_mjx.robot.task import RobotState, RobotTask
+from envs_mjx.robot.task import RobotState, RobotTask, turn_common, turn_poses, turn_vectors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +69,15 @@ class BlockTask(RobotTask):
         middle = env_state.qpos[4:6]
         low, high = scene.WORKSPACE_LOW[:2] - self.reach, scene.WORKSPACE_HIGH[:2] + self.reach
         return ((middle < low) | (middle > high)).any()
+
+    def turn(self, env_state: RobotState, angle: jax.Array) -> RobotState:
+        """Turned by `angle` (); object 0 is the one that began at smaller y, as `draw` has it."""
+        turned = turn_common(env_state, angle)
+        order = jnp.argsort(turned.poses[:, 1])
+        joints, speeds = turn_poses(env_state.qpos[4:], angle), turn_vectors(env_state.qvel[4:6], angle)
+        return dataclasses.replace(
+            turned, qpos=turned.qpos.at[4:].set(joints), qvel=turned.qvel.at[4:6].set(speeds),
+            poses=turned.poses[order], movable=jnp.where(order[0] == 0, env_state.movable, 1 - env_state.movable))
 
     def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Heights of the loose block, the fixed block, and the ground, each (84, 84)."""

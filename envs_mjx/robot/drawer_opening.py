@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from envs_mjx.robot import depth, scene
-from envs_mjx.robot.task import RobotState, RobotTask, first_valid
+from envs_mjx.robot.task import RobotState, RobotTask, first_valid, turn_common
 
 CABINET = (0.1065, 0.114, 0.054)  # depth, width, height
 TRAY, TRAY_WALL, TRAY_TOP, TRAY_FLOOR = 0.105, 0.003, 0.0495, 0.0075
@@ -87,6 +87,10 @@ class DrawerOpening(RobotTask):
     def solved(self, env_state: RobotState) -> jax.Array:
         """() bool: whether the loose drawer is open."""
         return env_state.qpos[4] > _OPEN
+
+    def turn(self, env_state: RobotState, angle: jax.Array) -> RobotState:
+        """Turned by `angle` (): the drawer's travel turns with its cabinet."""
+        return turn_common(env_state, angle)
 
     def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Heights of the loose drawer with its cabinet, of the locked ones, and of the table, each (84, 84)."""

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.base import ArraySpec, ContinuousActions, Environment, TimeStep, Variable
-from envs_mjx.robot import depth, noise, scene
+from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, TimeStep, Variable
+from envs_mjx.robot import depth, noise, rotation, scene
 
 OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit")
 """What `RobotState.outcome` counts."""
@@ -87,6 +87,10 @@ class RobotTask(Environment):
     def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Heights of the movable object, of the immovable one, and of the ground, each (84, 84)."""
 
+    @abc.abstractmethod
+    def turn(self, env_state: RobotState, angle: jax.Array) -> RobotState:
+        """The whole scene turned by `angle` () about the middle of the workspace; `turn_common` does what all share."""
+
     def left_workspace(self, env_state: RobotState) -> jax.Array:
         """() bool: whether the movable object is out of reach. Default: it cannot be."""
         del env_state
@@ -141,11 +145,56 @@ class RobotTask(Environment):
         masked = depth.depth(without, env_state.qpos[2], painted)
         return jnp.stack([seen, jnp.zeros_like(seen)], axis=-1), jnp.stack([seen, masked], axis=-1)
 
+    def demonstrations(self, key: jax.Array, number: int) -> Demonstrations:
+        """`number` episodes of the scripted expert (Appendix C.1), the successful ones of a few more first."""
+        from envs_mjx.robot import planner  # it builds on this module
+
+        episodes = planner.demonstrations(self, key, number)
+        return Demonstrations(episodes.states, episodes.actions, episodes.length, episodes.success)
+
+    def augment(self, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, jax.Array]:
+        """The scene and the action turned by a random angle (Appendix F), the noise in the image drawn anew.
+
+        The scene is turned and rendered again, not its image: exact, where turning pixels smooths edges, invents what
+        lies beyond the border and turns the painted fingers and the pad, which stay upright in real observations.
+        """
+        key_angle, key_noise = jax.random.split(key)
+        angle = rotation.random_angle(key_angle)
+        turned = self.turn(env_state, angle)
+        noise_key = turned.noise_key ^ _noise_key(key_noise)
+        return dataclasses.replace(turned, noise_key=noise_key), rotation.rotate_action(action, angle)
+
     def ground_truth(self, env_state: RobotState) -> jax.Array:
         """(7,) float32: which object is movable; the gripper's height and yaw; both objects relative to the gripper."""
         movable = env_state.movable.astype(jnp.float32)
         offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
         return jnp.concatenate([movable[None], env_state.qpos[2:4], offsets.reshape(-1)])
+
+
+def turn_common(env_state: RobotState, angle: jax.Array) -> RobotState:
+    """Gripper, poses and goal turned by `angle` () about the middle of the workspace; the objects' joints stay."""
+    gripper = turn_poses(env_state.qpos[jnp.array([0, 1, 3])], angle)
+    qpos = env_state.qpos.at[:2].set(gripper[:2]).at[3].set(gripper[2])
+    qvel = env_state.qvel.at[:2].set(turn_vectors(env_state.qvel[:2], angle))
+    return dataclasses.replace(env_state, qpos=qpos, qvel=qvel, poses=turn_poses(env_state.poses, angle),
+                               goal=turn_places(env_state.goal, angle))
+
+
+def turn_poses(poses: jax.Array, angle: jax.Array) -> jax.Array:
+    """(..., 3) x, y, yaw turned by `angle` () about the middle of the workspace."""
+    return jnp.concatenate([turn_places(poses[..., :2], angle), poses[..., 2:] + angle], axis=-1)
+
+
+def turn_places(places: jax.Array, angle: jax.Array) -> jax.Array:
+    """(..., 2) x, y turned by `angle` () about the middle of the workspace."""
+    centre = jnp.broadcast_to(jnp.asarray(scene.CENTRE), places.shape)
+    return turn_vectors(places - centre, angle) + centre
+
+
+def turn_vectors(vectors: jax.Array, angle: jax.Array) -> jax.Array:
+    """(..., 2) x, y turned by `angle` ()."""
+    cos, sin, x, y = jnp.cos(angle), jnp.sin(angle), vectors[..., 0], vectors[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _noise_key(key: jax.Array) -> jax.Array:

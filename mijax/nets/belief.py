@@ -45,6 +45,7 @@ class BeliefBranches(nn.Module):
     observation_spec: ArraySpec
     features: int
     believer: BelieverConfig
+    after_trunk: bool = False  # as in `TwoBranch`
 
     def setup(self) -> None:
         net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
@@ -56,7 +57,9 @@ class BeliefBranches(nn.Module):
         self.bottom = self.make_bottom()
 
     def make_bottom(self) -> Any:
-        """The encoder of the memoryless branch, of psi's architecture."""
+        """The encoder of the memoryless branch, of psi's architecture, or its output layer."""
+        if self.after_trunk:
+            return nn.Dense(self.features, dtype=jnp.dtype(self.top.network.dtype))
         return encoder_for(self.observation_spec, self.features)
 
     def branches(self, tokens: Tokens, deterministic: bool = True) -> Belief:
@@ -84,7 +87,7 @@ class BeliefBranches(nn.Module):
     def step_branches(
         self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
     ) -> tuple[MemoryState, jax.Array]:
-        """One token for each of (B,) episodes -> new memory, (B, W + F) the belief beside the observation's features."""
+        """One token for each of (B,) episodes -> new memory, (B, W + F) belief and features of the observation."""
         state, summary = self.top.step(state, observation, previous_action)
         noise = self._fixed(self.believer.samples)[None]
         return state, self._embed(self.summarise(summary), noise, self.bottom(observation))

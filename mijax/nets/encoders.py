@@ -44,20 +44,20 @@ class Convolution(nn.Module):
     """A convolution without padding, written as one matrix product: (..., rows, columns, C) -> (..., r, c, channels).
 
     XLA's own convolutions are many times slower on a CPU inside a scan (Sphinx: 5 against 50 updates/s, measured).
-    `kernel` must be a multiple of `stride`: pixels are first gathered in blocks of stride x stride. `blank` further
-    channels have weights but are left out of `x`, since they are always 0.
+    `kernel` must be a multiple of `stride`: pixels are first gathered in blocks of stride x stride. Of `inputs`
+    channels the last ones may be left out of `x`, where they are always 0: their weights are then not used.
     """
 
     channels: int
     kernel: int
     stride: int
-    blank: int = 0
+    inputs: int | None = None  # C where None
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         stride, side, shown = self.stride, self.kernel // self.stride, x.shape[-1]
         weights = self.param(
-            "kernel", nn.initializers.lecun_normal(), (self.kernel, self.kernel, shown + self.blank, self.channels))
+            "kernel", nn.initializers.lecun_normal(), (self.kernel, self.kernel, self.inputs or shown, self.channels))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.channels,))
         weights, bias = weights[..., :shown, :].astype(x.dtype), bias.astype(x.dtype)
         blocks = _gather_blocks(x, stride)
@@ -126,12 +126,12 @@ class ImageEncoder(nn.Module):
     plan: tuple[ConvBlock, ...]
     features: int
     dtype: jnp.dtype = jnp.float32
-    blank: int = 0  # trailing channels that are left out of the images, since they are always 0
+    channels: int | None = None  # of the images; of these the last may be left out where they are always 0
 
     def setup(self) -> None:
-        blanks = (self.blank, *(0 for _ in self.plan[1:]))
+        inputs = (self.channels, *(None for _ in self.plan[1:]))
         self.blocks = [
-            Convolution(b.channels, b.kernel, b.stride, blank) for b, blank in zip(self.plan, blanks, strict=True)]
+            Convolution(b.channels, b.kernel, b.stride, count) for b, count in zip(self.plan, inputs, strict=True)]
         self.output = nn.Dense(self.features, dtype=self.dtype)
 
     @property
@@ -191,13 +191,10 @@ def _fits(plan: Sequence[ConvBlock], size: int) -> bool:
     return size >= 1
 
 
-def encoder_for(spec: ArraySpec, features: int, dtype: jnp.dtype = jnp.float32, blank: int = 0) -> Encoder:
-    """The encoder of arrays like `spec`: vectors (D,) or images (rows, columns, channels).
-
-    `blank` is how many of the trailing channels are left out of the images that it is given.
-    """
+def encoder_for(spec: ArraySpec, features: int, dtype: jnp.dtype = jnp.float32) -> Encoder:
+    """The encoder of arrays like `spec`: vectors (D,) or images (rows, columns, channels)."""
     if spec.is_image:
-        return ImageEncoder(image_plan(min(spec.shape[:2])), features, dtype, blank)
+        return ImageEncoder(image_plan(min(spec.shape[:2])), features, dtype, spec.shape[2])
     if len(spec.shape) == 1:
         return VectorEncoder(hidden=VECTOR_HIDDEN, features=features, dtype=dtype)
     raise ValueError(f"no encoder for arrays of shape {spec.shape}: vectors (D,) and images (rows, columns, channels)")

@@ -11,17 +11,19 @@ from mijax.nets.encoders import STRIDED_IMAGE_MINIMUM, Convolution, image_plan
 
 
 class MLP(nn.Module):
-    """ReLU layers of `hidden` units, then a linear layer of `features`."""
+    """ReLU layers of `hidden` units, normalised first if `norm`, then a linear layer of `features`."""
 
     hidden: Sequence[int]
     features: int
     dtype: jnp.dtype = jnp.float32
     start_at_zero: bool = False  # the linear layer starts with zeros
+    norm: bool = False
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for width in self.hidden:
-            x = nn.relu(nn.Dense(width, dtype=self.dtype)(x))
+            x = nn.Dense(width, dtype=self.dtype)(x)
+            x = nn.relu(nn.LayerNorm(dtype=self.dtype)(x) if self.norm else x)
         last = nn.initializers.zeros if self.start_at_zero else nn.initializers.lecun_normal()
         return nn.Dense(self.features, kernel_init=last, dtype=self.dtype)(x)
 

@@ -134,6 +134,7 @@ class TwoBranch(nn.Module):
     bottom_psi: bool  # the memoryless branch has psi's architecture, so that it can start from it
     predicts_state: bool = False  # the memory branch has a head that predicts z_s (the auxiliary task)
     predicts_itself: bool = False  # and one that predicts its own next summary (Eq. 6)
+    after_trunk: bool = False  # observations come as features of psi's body: only its output layer is left to do
 
     def setup(self) -> None:
         net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
@@ -146,6 +147,8 @@ class TwoBranch(nn.Module):
 
     def make_bottom(self) -> Any:
         """The encoder of the memoryless branch: psi's, or one of the agent's own."""
+        if self.bottom_psi and self.after_trunk:
+            return nn.Dense(self.features, dtype=jnp.dtype(self.top.network.dtype))
         if self.bottom_psi:
             return encoder_for(self.observation_spec, self.features)
         return own_encoder(self.observation_spec, jnp.dtype(self.top.network.dtype))

@@ -187,7 +187,7 @@ class Learner:
         table, declaration = self.observations, self.agent.declaration
 
         def label(timestep: TimeStep, action: jax.Array, env_state: EnvState, symmetry: jax.Array | None) -> jax.Array:
-            if copies:
+            if symmetry is not None:
                 moved = jax.vmap(jax.vmap(functools.partial(show_copy, self.env), (None, 0, None, None)),
                                  (0, None, 0, 0))
                 timestep, _ = moved(symmetry, jnp.arange(copies + 1, dtype=jnp.int32), env_state, action)

@@ -20,7 +20,6 @@ from envs_mjx import registry
 from envs_mjx.base import ContinuousActions, Environment
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
-from mijax.agents.core import Agent
 from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
 from mijax.learner import make_learner
@@ -196,7 +195,7 @@ def _loop(
     """Chunks, evaluations, metrics and checkpoints up to the run's steps; False when asked to stop before."""
     config = options.config
     tracker, stop = make_tracker(options.track, run), StopRequest(say)
-    evaluations = 0
+    agent, evaluations = runner.learner.agent, 0
 
     def save() -> None:
         for seed, state in runner.states().items():
@@ -207,7 +206,7 @@ def _loop(
             while runner.step < config.steps and not stop.asked:
                 rows = _advance(runner, config, clock)
                 for seed, row in rows.items():
-                    _refuse_divergence(seed, row, runner.learner.agent)
+                    _refuse_divergence(seed, row, agent.group, agent.options.learning_rate)
                     run.append(seed, row)
                     tracker.log(seed, row)
                 progress.update(runner.step, _overview(rows))
@@ -246,12 +245,12 @@ def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[in
     }
 
 
-def _refuse_divergence(seed: int, row: Mapping[str, float], agent: Agent) -> None:
+def _refuse_divergence(seed: int, row: Mapping[str, float], group: str, learning_rate: float) -> None:
     bad = [name for name, value in row.items() if name.startswith("loss/") and not np.isfinite(value)]
     if bad:
         raise TrainingError(
             f"seed {seed}: {bad[0]} is {row[bad[0]]} at step {row['step']:,}; go on from the last checkpoint "
-            f"or try a smaller --{agent.group}.learning-rate than {agent.options.learning_rate}")
+            f"or try a smaller --{group}.learning-rate than {learning_rate}")
 
 
 def _overview(rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:

@@ -21,9 +21,9 @@ class CompassState:
 class Compass(Environment):
     """A direction is seen at the start; after two empty steps the action must point there: +1 if it does, else 0.
 
-    Observation (4,): the direction at time 0 and zeros later, the time, and whether the episode is over. State (3,): the
-    direction and the time. Without memory nothing beats a guess: the action must be within 45 degrees, so 0.25. Turning
-    the world changes nothing.
+    Observation (4,): the direction at time 0 and zeros later, the time, and whether the episode is over. State (3,):
+    the direction and the time. Without memory nothing beats a guess: the action must be within 45 degrees, so 0.25.
+    Turning the world changes nothing.
     """
 
     name, horizon, choice = "compass", 4, 2
@@ -55,8 +55,8 @@ class Compass(Environment):
             first, _ = self.reset(key)
 
             def step(env_state: CompassState, _: None) -> tuple[CompassState, CompassState]:
-                env_state, _ = self.step(key, env_state, 0.8 * first.cue)
-                return env_state, env_state
+                later = self.step(key, env_state, 0.8 * first.cue)[0]
+                return later, later
 
             _, later = jax.lax.scan(step, first, None, self.horizon)
             states = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), first, later)

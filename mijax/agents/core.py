@@ -242,14 +242,12 @@ class Agent(abc.ABC):
         self, online: Sequence[Heads], averaged: Sequence[Heads], tokens: Tokens, representation: Representation | None
     ) -> tuple[jax.Array, Metrics]:
         """The weighted losses of the heads of every memory branch, added up; () and their means by kind."""
-        loss, metrics = jnp.zeros(()), {}
+        loss, found = jnp.zeros(()), []
         for branch, average in zip(online, averaged, strict=True):
             loss_branch, parts = self._auxiliary_of_branch(branch, average, tokens, representation)
             loss += loss_branch
-            for name, value in parts.items():
-                metrics.setdefault(name, []).append(value)
-        return loss, {name: sum(values) / len(values) if len(values) > 1 else values[0]
-                      for name, values in metrics.items()}
+            found.append(parts)
+        return loss, jax.tree.map(lambda *values: jnp.mean(jnp.stack(values)), *found) if found else {}
 
     def _auxiliary_of_branch(
         self, online: Heads, averaged: Heads, tokens: Tokens, representation: Representation | None

@@ -165,6 +165,11 @@ class SAC(Agent):
         """Of the actor's and the critics' branches, or of the one they share."""
         return self._encode(agent, self.look(agent, tokens), key).heads
 
+    @property
+    def _exact(self) -> bool:
+        """Whether gradient passes draw nothing: neither dropout nor Believer's latents."""
+        return self.config.network.dropout == 0 and not self.declaration.believes
+
     def _call(self, method: str, params: Params, *arguments: Any) -> Any:
         return self.network.apply({"params": params}, *arguments, method=method)
 
@@ -172,8 +177,7 @@ class SAC(Agent):
         """With dropout only where there is a key."""
         rngs = None if key is None else {"dropout": key}
         return cast(Encoded, self.network.apply(
-            {"params": agent}, looked, key is None or (self._exact and not self.declaration.believes), rngs=rngs,
-            method="encode"))
+            {"params": agent}, looked, key is None or self._exact, rngs=rngs, method="encode"))
 
     def _draw(self, agent: Params, seen: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """(N, A) actions of the actor, and (N,) their log densities."""

@@ -153,11 +153,11 @@ class TwoBranchActorCritic(_WithTrunk):
             state = self.state_encoder(cast(jax.Array, tokens.states))
             parts.append(state.astype(actor.both.dtype))
 
-        def of_tokens(x: jax.Array) -> jax.Array:
-            return x.astype(jnp.float32).reshape(*tokens.segment.shape, -1)
+        def of_tokens(x: jax.Array | None) -> jax.Array | None:
+            return None if x is None else x.astype(jnp.float32).reshape(*tokens.segment.shape, -1)
 
-        heads = tuple(BranchHeads(*(None if x is None else of_tokens(x) for x in (b.summary, b.z_s, b.next_summary)))
-                      for b in branches)
+        heads = tuple(
+            BranchHeads(of_tokens(b.summary), of_tokens(b.z_s), of_tokens(b.next_summary)) for b in branches)
         return Encoded(actor.both, jnp.concatenate(parts, axis=-1), heads)
 
     def initial_state(self, batch: int) -> MemoryState:

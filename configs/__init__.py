@@ -5,9 +5,9 @@ import importlib
 from mijax.config import Config
 
 DOMAINS = ("heaven_hell", "sphinx", "carflag_2d")
-"""Domains that can be trained: CI tries each, the bench measures each."""
+"""Domains with discrete actions, trained by Double DQN: CI tries each, the bench measures each."""
 ROBOTS = ("block_pulling", "block_pushing", "drawer_opening")
-"""Domains with continuous actions: their presets wait for SAC."""
+"""Domains with continuous actions, trained by SAC."""
 
 
 def preset(domain: str) -> Config:

@@ -6,10 +6,11 @@ from mijax.config import Config
 
 CRITIC_LEARNING_RATE = {"sphinx": 3e-5, "carflag_2d": 3e-5}
 """Table 2: 3e-5 on Sphinx and CarFlag-2D, 3e-4 elsewhere."""
-INTRINSIC_WEIGHT = {"heaven_hell": 10.0, "sphinx": 10.0, "carflag_2d": 0.0}
+ROBOTS = ("block_pulling", "block_pushing", "drawer_opening")
+INTRINSIC_WEIGHT = {"heaven_hell": 10.0, "sphinx": 10.0, "carflag_2d": 0.0} | dict.fromkeys(ROBOTS, 0.1)
 """Table 2, for the bonus in its cosine form."""
-STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000}
-"""10 000 and 20 000 episodes of 50 steps."""
+STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000} | dict.fromkeys(ROBOTS, 40_000)
+"""10 000, 20 000 and 800 episodes of 50 steps."""
 EPOCHS = 1000
 TABLE_3 = {"sphinx": {"learning_rate": 1e-3},
            "carflag_2d": {"learning_rate": 1e-3, "episodes": 1000, "lambda_r": 1.0},
@@ -26,15 +27,20 @@ def paper(config: Config, vector_observation: bool) -> Config:
     """A domain's preset with the paper's networks, losses, schedule, budget and stage 1: 1000 epochs, plain Adam."""
     steps = STEPS.get(config.domain, 500_000)
     network = dataclasses.replace(
-        config.network, gru_width=128, critic_hidden=(256, 256), auxiliary_hidden=(128, 128), dropout=0.1,
-        action_embedding=64 if vector_observation else 16, observation_embedding=64 if vector_observation else 100)
+        config.network, gru_width=128, critic_hidden=(256, 256), actor_hidden=(256, 256), auxiliary_hidden=(128, 128),
+        dropout=0.1, action_embedding=64 if vector_observation else 16,
+        observation_embedding=64 if vector_observation or config.domain in ROBOTS else 100)
     dqn = dataclasses.replace(
         config.dqn, learning_rate=CRITIC_LEARNING_RATE.get(config.domain, 3e-4), final_learning_rate=1.0, discount=0.99,
         trace_decay=0.0, target_rate=0.005, batch_episodes=64, updates_per_step=0.25, warmup_episodes=10,
-        epsilon_steps=steps // 10)
+        epsilon_steps=steps // 10, value_bound=0.0)
+    sac = dataclasses.replace(
+        config.sac, learning_rate=3e-4, final_learning_rate=1.0, discount=0.99, trace_decay=0.0, target_rate=0.005,
+        batch_episodes=64, updates_per_step=1.0, shared_trunk=False, critic_norm=False)
     information = dataclasses.replace(
         config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(config.domain, 10.0),
         intrinsic_form="cosine")
     stage1 = dataclasses.replace(
         config.stage1, epochs=EPOCHS, rewarded=0, phi_shrinkage=0.0, **TABLE_3.get(config.domain, {}))
-    return dataclasses.replace(config, steps=steps, network=network, dqn=dqn, information=information, stage1=stage1)
+    return dataclasses.replace(config, steps=steps, network=network, dqn=dqn, sac=sac, information=information,
+                               stage1=stage1)

@@ -57,6 +57,8 @@ class ArraySpec:
 
     shape: tuple[int, ...]
     dtype: Any = np.float32
+    blank: int = 0
+    """Trailing channels of an image that are always 0: learners may leave them out of what they store and encode."""
 
     @property
     def is_image(self) -> bool:

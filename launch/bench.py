@@ -217,7 +217,7 @@ def bench_seeds(bench: Bench, env: Environment) -> Iterator[Result]:
         compile_seconds = time.perf_counter() - started
         seconds = min(_seconds_of(runner.advance) for _ in range(bench.sizes.repetitions))
         one = one or seconds
-        updates = runner.learner.iterations_per_chunk * config.updates_per_iteration
+        updates = runner.learner.iterations_per_chunk * runner.learner.updates_per_iteration
         yield Result(env.name, f"{count} seed{'s' * (count > 1)} by {runner.strategy}", updates / seconds, "updates",
                      seconds / updates * 1e3, compile_seconds, None, None, peak_memory_mib(),
                      f"updates of all seeds, with the environment steps between: {seconds / one:.2f} times one seed; "

@@ -112,6 +112,8 @@ class NetworkConfig:
     """Width of the embedded observation (paper: 64 for vectors, 100 for images)."""
     critic_hidden: tuple[int, ...] = (128, 128)
     """Hidden layers of the Q head (paper: 256, 256)."""
+    actor_hidden: tuple[int, ...] = (128, 128)
+    """Hidden layers of SAC's actor (paper: 256, 256)."""
     auxiliary_hidden: tuple[int, ...] = (64, 64)
     """Hidden layers of the heads that predict z_s (paper: 128, 128)."""
     dropout: float = 0.1
@@ -128,7 +130,7 @@ class NetworkConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DQNConfig:
-    """Double DQN on whole episodes (paper Appendix A.6, Table 2).
+    """Double DQN on whole episodes, for discrete actions (paper Appendix A.6, Table 2).
 
     The defaults are what measurement found on Heaven-Hell; the paper's values stand beside them. What mattered, in
     order: returns with traces, few updates per step (the paper's ratio shows each step to the learner 816 times, and a
@@ -175,6 +177,59 @@ class DQNConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SACConfig:
+    """Soft actor-critic on whole episodes, for continuous actions (paper Appendix A.6, Table 2).
+
+    The paper's values stand beside ours where they differ.
+    """
+
+    learning_rate: float = 3e-4
+    """Adam step size of the actor, the critics, f and the temperature."""
+    final_learning_rate: float = 1.0
+    """The step size falls linearly to this fraction of itself over the run's steps; 1 keeps it constant."""
+    discount: float = 0.99
+    """gamma of the learner."""
+    trace_decay: float = 0.0
+    """lambda of the returns that the critics learn, with uncorrected traces; 0 gives the one-step target."""
+    target_rate: float = 0.005
+    """tau: how far the target network moves towards the online network after every update."""
+    initial_temperature: float = 0.01
+    """alpha at the start; it is learnt."""
+    target_entropy: float = -1.0
+    """What the actor's entropy is held at, in nats per dimension of the action."""
+    batch_episodes: int = 32
+    """Episodes per update, an even number (paper's table: 64, its program: 32)."""
+    updates_per_step: float = 1.0
+    """Gradient updates per environment step."""
+    replay_steps: int = 100_000
+    """Capacity of the replay, in steps of full-length episodes."""
+    warmup_episodes: int = 2
+    """Random episodes before the first update."""
+    demonstrations: int = 0
+    """Episodes of the environment's expert in the replay from the start (paper: 80 on the robots)."""
+    rotated_copies: int = 0
+    """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
+    original (paper: 4 on the robots)."""
+    shared_trunk: bool = True
+    """Whether frames are encoded once per update, for the actor, the critics, their targets and f, with a last layer of
+    its own for each branch. Otherwise each branch has a whole encoder (the paper)."""
+    critic_norm: bool = True
+    """Whether the critics' hidden layers are normalised, which keeps values of unseen actions in bounds (paper: no)."""
+    bootstrap_at_time_limit: bool = False
+    """Whether the value of the last state counts when the time limit ends an episode."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("sac.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes")
+        _require_at_least("sac.", self, 0, "demonstrations", "rotated_copies")
+        for name in ("learning_rate", "updates_per_step", "initial_temperature"):
+            require(getattr(self, name) > 0, f"sac.{name}".replace("_", "-"), getattr(self, name), "a number > 0")
+        require(self.batch_episodes % 2 == 0, "sac.batch-episodes", self.batch_episodes, "an even number")
+        for name in ("discount", "trace_decay", "target_rate", "final_learning_rate"):
+            value = getattr(self, name)
+            require(0 <= value <= 1, f"sac.{name}".replace("_", "-"), value, "a number in [0, 1]")
+
+
+@dataclasses.dataclass(frozen=True)
 class InformationConfig:
     """What the privileged features z_s are used for in stage 2 (paper Section 3.2)."""
 
@@ -196,7 +251,7 @@ class InformationConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SelfPredictionConfig:
-    """ZP-DRQN alone (paper Appendix A.2)."""
+    """ZP-DRQN and ZP-RSAC alone (paper Appendix A.2)."""
 
     weight: float = 1.0
     """Weight of the prediction of the next history summary (Table 2)."""
@@ -207,7 +262,7 @@ class SelfPredictionConfig:
 
 @dataclasses.dataclass(frozen=True)
 class BelieverConfig:
-    """B-DQN alone (paper Appendix A.5)."""
+    """B-DQN and B-SAC alone (paper Appendix A.5)."""
 
     history_width: int = 16
     """Width of the history's summary x (Table 2: X-Dim)."""
@@ -281,7 +336,7 @@ class Config:
     domain: str = "heaven_hell"
     """A registered environment, or `package.module:EnvClass`."""
     agent: str = "mi"
-    """mi (ours), base (DTQN), zp, ba, ua, believer or mdp: see mijax.agents.variants."""
+    """mi (ours), base (DTQN or TSAC), zp, ba, ua, believer or mdp: see mijax.agents.variants."""
     memory: MemoryName = "auto"
     """The sequence model of the memory branch. auto: the agent's own, for most a gpt; mlp: no memory."""
     steps: int = 100_000
@@ -293,6 +348,7 @@ class Config:
     stage1: Stage1Config = dataclasses.field(default_factory=Stage1Config)
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
     dqn: DQNConfig = dataclasses.field(default_factory=DQNConfig)
+    sac: SACConfig = dataclasses.field(default_factory=SACConfig)
     information: InformationConfig = dataclasses.field(default_factory=InformationConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
     zp: SelfPredictionConfig = dataclasses.field(default_factory=SelfPredictionConfig)
@@ -304,10 +360,6 @@ class Config:
     def __post_init__(self) -> None:
         _require_at_least("", self, 1, "steps", "num_envs", "steps_per_iteration")
         steps = self.iteration_steps
-        updates = self.dqn.updates_per_step * steps
-        whole = updates >= 1 and abs(updates - round(updates)) < 1e-9
-        require(whole, "dqn.updates-per-step", self.dqn.updates_per_step,
-                f"a whole number of updates in num-envs x steps-per-iteration = {steps} steps")
         require(self.evaluation.every % steps == 0, "evaluation.every", self.evaluation.every,
                 f"a multiple of num-envs x steps-per-iteration = {steps}")
 
@@ -316,10 +368,14 @@ class Config:
         """Environment steps of one learner iteration, over all environments."""
         return self.num_envs * self.steps_per_iteration
 
-    @property
-    def updates_per_iteration(self) -> int:
-        """Gradient updates of one learner iteration."""
-        return round(self.dqn.updates_per_step * self.iteration_steps)
+    def updates_per_iteration(self, group: str, updates_per_step: float) -> int:
+        """Gradient updates of one learner iteration; `ConfigError` unless a whole number, at least 1."""
+        steps = self.iteration_steps
+        updates = updates_per_step * steps
+        whole = updates >= 1 and abs(updates - round(updates)) < 1e-9
+        require(whole, f"{group}.updates-per-step", updates_per_step,
+                f"a whole number of updates in num-envs x steps-per-iteration = {steps} steps")
+        return round(updates)
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:

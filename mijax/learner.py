@@ -15,17 +15,27 @@ import jax.numpy as jnp
 from flax import struct
 from jax.typing import DTypeLike
 
-from envs_mjx.base import DiscreteActions, Environment, TimeStep
-from mijax.agents.dqn import DQN, AgentState, make_agent
+from envs_mjx.base import DiscreteActions, Environment, EnvState, TimeStep
+from mijax.agents.core import Agent, AgentState
+from mijax.agents.factory import make_agent
 from mijax.agents.variants import variant
+from mijax.augmentation import show_copy, show_tokens, shows_again
 from mijax.config import Config
 from mijax.frames import FrameTable
 from mijax.nets.encoders import encoder_for
 from mijax.nets.privileged import StateShown
-from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices, stack_folds
-from mijax.replay import Replay, StepRecord, init_replay, sample_episodes, write
-from mijax.rollout import Episodes, EpisodeTotals, Recorder, collect_step, evaluate, start_episodes
-from mijax.types import Metrics, Representation
+from mijax.packing import Layout, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
+from mijax.replay import Replay, StepRecord, fill, init_replay, sample_episodes, write
+from mijax.rollout import (
+    Episodes,
+    EpisodeTotals,
+    Recorder,
+    collect_step,
+    draw_symmetry,
+    evaluate,
+    start_episodes,
+)
+from mijax.types import Metrics, Representation, Tokens
 
 
 @struct.dataclass
@@ -47,18 +57,21 @@ class Learner:
     domain: Environment
     env: Environment  # what the agent acts in: the domain, or the domain with its state shown
     config: Config
-    agent: DQN
+    agent: Agent
     observations: FrameTable | None  # all that the environment can show; the replay then stores which, not what
+    moments: bool = False  # whether the replay stores moments, which are shown again when they are sampled
     pack: bool = True  # choose the number of packed rows at run time; a branch that `vmap` would turn into all of them
 
     def init(self, key: jax.Array, representation: Representation | None) -> LearnerState:
-        """Fresh networks and a replay warmed up by random episodes."""
+        """Fresh networks and a replay warmed up by random episodes, after demonstrations where they are asked for."""
         key_agent, key_start, key_warmup, key_run = jax.random.split(key, 4)
         num_envs = self.config.num_envs
         episodes = start_episodes(self.env, self.agent, num_envs, key_start)
-        first = self.recorder(representation)(episodes.timestep, episodes.previous_action)
-        capacity = max(num_envs, self.config.dqn.replay_steps // self.env.horizon)
+        first = self._first(representation, episodes)
+        capacity = max(num_envs, self.demonstrations, self.agent.options.replay_steps // self.env.horizon)
         replay = init_replay(first, capacity, self.env.horizon)
+        if self.demonstrations:
+            replay = self._demonstrate(replay, representation, jax.random.fold_in(key_start, 1))
         state = LearnerState(
             agent=self.agent.init(key_agent, representation),
             representation=representation,
@@ -72,12 +85,35 @@ class Learner:
             state = dataclasses.replace(state, agent=self._believe(state, jax.random.fold_in(key_agent, 1)))
         return state
 
+    def _first(self, representation: Representation | None, episodes: Episodes) -> StepRecord:
+        """What the replay stores of where episodes stand."""
+        return self.recorder(representation)(
+            episodes.timestep, episodes.previous_action, episodes.env_state, episodes.symmetry)
+
+    def _demonstrate(self, replay: Replay, representation: Representation | None, key: jax.Array) -> Replay:
+        """The replay with the successful episodes of an expert."""
+        shown = self.env.demonstrations(key, self.demonstrations)
+        assert shown is not None
+        record, none = self.recorder(representation), self.agent.no_action(1)
+        symmetries = draw_symmetry(key, self.demonstrations)
+
+        def store(episode: tuple) -> StepRecord:
+            env_state, action, symmetry = episode
+            previous = jnp.concatenate([none, action.astype(none.dtype)])
+            symmetry = jnp.broadcast_to(symmetry[None], (previous.shape[0], 2)) if self.agent.copies else None
+            return record(jax.vmap(self.env.show)(env_state), previous, env_state, symmetry)
+
+        records = jax.lax.map(store, (shown.env_state, shown.action, symmetries))
+        order = jnp.argsort(~shown.success, stable=True)
+        records, length = jax.tree.map(lambda x: x[order], (records, shown.length))
+        return fill(replay, records, length + 1, jnp.sum(shown.success, dtype=jnp.int32))
+
     def _believe(self, state: LearnerState, key: jax.Array) -> AgentState:
         """Fit Believer's history VAE to as many random episodes as stage 1 has (paper Appendix A.5, Stage 2)."""
         key_start, key_collect, key_update = jax.random.split(key, 3)
         num_envs = self.config.num_envs
         open_episodes = start_episodes(self.env, self.agent, num_envs, key_start)
-        first = self.recorder(state.representation)(open_episodes.timestep, open_episodes.previous_action)
+        first = self._first(state.representation, open_episodes)
         replay = init_replay(first, max(self.config.stage1.episodes, num_envs), self.env.horizon)
         random = dataclasses.replace(
             state, episodes=open_episodes, replay=write(replay, first, open_episodes.position))
@@ -93,8 +129,18 @@ class Learner:
     @property
     def warmup_steps(self) -> int:
         """Random environment steps before the first update: at least `warmup_episodes` full-length episodes."""
-        rounds = -(-self.config.dqn.warmup_episodes // self.config.num_envs)
+        rounds = -(-self.agent.options.warmup_episodes // self.config.num_envs)
         return rounds * self.config.num_envs * self.env.horizon
+
+    @property
+    def demonstrations(self) -> int:
+        """Episodes of an expert in the replay from the start."""
+        return self.config.sac.demonstrations if self.agent.group == "sac" else 0
+
+    @property
+    def updates_per_iteration(self) -> int:
+        """Gradient updates of one iteration."""
+        return self.config.updates_per_iteration(self.agent.group, self.agent.options.updates_per_step)
 
     @property
     def iterations_per_chunk(self) -> int:
@@ -107,9 +153,7 @@ class Learner:
 
     def epsilon(self, environment_steps: jax.Array) -> jax.Array:
         """() exploration after so many steps."""
-        dqn = self.config.dqn
-        progress = jnp.minimum(environment_steps / dqn.epsilon_steps, 1)
-        return 1 + (dqn.epsilon_final - 1) * progress
+        return self.agent.epsilon(environment_steps)
 
     def run_chunk(self, state: LearnerState, iterations: int | None = None) -> tuple[LearnerState, Metrics]:
         """Advance by `iterations` (default: up to the next evaluation); metrics are means over the chunk."""
@@ -138,22 +182,35 @@ class Learner:
     def recorder(self, representation: Representation | None) -> Recorder:
         """What the replay stores, z_s among it when there is a representation."""
         phi = encoder_for(self.env.state_spec, self.config.stage1.features)
-        num_actions = cast(DiscreteActions, self.env.action_spec).num
+        spec, copies = self.env.action_spec, self.agent.copies
+        action_type = _integer_for(spec.num) if isinstance(spec, DiscreteActions) else jnp.float32
         table, declaration = self.observations, self.agent.declaration
 
-        def record(timestep: TimeStep, previous_action: jax.Array) -> StepRecord:
-            z_s = None
+        def label(timestep: TimeStep, action: jax.Array, env_state: EnvState, symmetry: jax.Array | None) -> jax.Array:
+            if symmetry is not None:
+                moved = jax.vmap(jax.vmap(functools.partial(show_copy, self.env), (None, 0, None, None)),
+                                 (0, None, 0, 0))
+                timestep, _ = moved(symmetry, jnp.arange(copies + 1, dtype=jnp.int32), env_state, action)
+            return cast(jax.Array, phi.apply({"params": cast(Representation, representation).phi}, timestep.state))
+
+        def record(
+            timestep: TimeStep, previous_action: jax.Array, env_state: EnvState = None,
+            symmetry: jax.Array | None = None,
+        ) -> StepRecord:
+            z_s, observation = None, env_state if self.moments else timestep.observation
             if representation is not None and not declaration.sees_state:
-                z_s = cast(jax.Array, phi.apply({"params": representation.phi}, timestep.state))
-            index = None if table is None else table.index_of(timestep.observation).astype(_integer_for(len(table)))
+                z_s = label(timestep, previous_action, env_state, symmetry)
+            if table is not None:
+                observation = table.index_of(timestep.observation).astype(_integer_for(len(table)))
             return StepRecord(
-                observation=timestep.observation if index is None else index,
-                previous_action=previous_action.astype(_integer_for(num_actions)),
+                observation=observation,
+                previous_action=previous_action.astype(action_type),
                 reward=timestep.reward,
                 terminated=timestep.terminated,
                 truncated=timestep.truncated,
                 z_s=z_s,
-                state=None if declaration.critic is None else timestep.state,
+                state=None if declaration.critic is None or self.moments else timestep.state,
+                symmetry=symmetry,
             )
 
         return record
@@ -176,7 +233,7 @@ class Learner:
         def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, Metrics]:
             return self.update(agent, state.replay, state.representation, key)
 
-        agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, self.config.updates_per_iteration))
+        agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, self.updates_per_iteration))
         return dataclasses.replace(state, agent=agent), jax.tree.map(jnp.mean, metrics)
 
     def update(
@@ -187,28 +244,37 @@ class Learner:
         losses without the values'.
         """
         apply: Callable = self.agent.pretrain if pretrain else self.agent.update
-        batch = self.config.dqn.batch_episodes
+        batch = self.agent.options.batch_episodes
         key_sample, key_loss = jax.random.split(key)
         slots = sample_episodes(replay, key_sample, batch)
         if not self.pack:
-            tokens = gather_rows(replay, slots, one_per_row(batch), batch, self.observations)
-            return apply(agent, tokens, representation, key_loss)
+            return apply(agent, self._read(replay, slots, one_per_row(batch), batch, key), representation, key_loss)
         layout = fit_folds(replay.length[slots], replay.data.reward.shape[1])
         choices = row_choices(batch // 2)
 
         def with_rows(rows: int) -> tuple[AgentState, Metrics]:
-            tokens = gather_rows(replay, slots, stack_folds(layout, rows), 2 * rows, self.observations)
+            tokens = self._read(replay, slots, stack_folds(layout, rows), 2 * rows, key)
             return apply(agent, tokens, representation, key_loss)
 
         branch = jnp.searchsorted(jnp.asarray(choices), layout.num_rows)
         return jax.lax.switch(branch, [functools.partial(with_rows, rows) for rows in choices])
+
+    def _read(self, replay: Replay, slots: jax.Array, layout: Layout, rows: int, key: jax.Array) -> Tokens:
+        """(B,) episodes in so many rows, shown again where the replay stores moments."""
+        tokens = gather_rows(replay, slots, layout, rows, self.observations)
+        if not self.moments:
+            return tokens
+        wants_state = self.agent.declaration.critic is not None
+        return show_tokens(
+            self.env, tokens, self.agent.copies, slots.shape[0], jax.random.fold_in(key, 1), wants_state)
 
 
 def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:
     """The learner that a configuration describes."""
     domain, env = env, StateShown(env) if variant(config.agent).sees_state else env
     listed = env.all_observations()
-    return Learner(domain, env, config, make_agent(env, config), None if listed is None else FrameTable(listed), pack)
+    table = None if listed is None else FrameTable(listed)
+    return Learner(domain, env, config, make_agent(env, config), table, table is None and shows_again(env), pack)
 
 
 def _integer_for(count: int) -> DTypeLike:

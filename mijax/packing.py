@@ -64,7 +64,10 @@ def row_choices(episodes: int) -> tuple[int, ...]:
 def gather_rows(
     replay: Replay, slots: jax.Array, layout: Layout, rows: int, observations: FrameTable | None
 ) -> Tokens:
-    """Read (B,) episodes from the replay into `rows` packed rows; `observations` as for `Learner`."""
+    """Read (B,) episodes from the replay into `rows` packed rows; `observations` as for `Learner`.
+
+    Segment b + 1 is episode b.
+    """
     row_length = replay.data.reward.shape[1]
     step = jnp.arange(row_length)[None]
     length = replay.length[slots]
@@ -82,7 +85,7 @@ def gather_rows(
     return Tokens(
         frames=data.observation if observations is None else observations,
         frame=None if observations is None else shaped(data.observation.astype(jnp.int32)),
-        previous_action=shaped(jnp.where(used, data.previous_action.astype(jnp.int32), -1)),
+        previous_action=shaped(_actions(data.previous_action, used)),
         reward=shaped(data.reward),
         terminated=shaped(data.terminated),
         truncated=shaped(data.truncated),
@@ -90,4 +93,12 @@ def gather_rows(
         position=shaped(jnp.where(used, position, 0)),
         z_s=None if data.z_s is None else shaped(data.z_s.astype(jnp.float32)),
         states=data.state,
+        symmetry=None if data.symmetry is None else shaped(data.symmetry),
     )
+
+
+def _actions(stored: jax.Array, used: jax.Array) -> jax.Array:
+    """(N,) int32 with -1 where not used, or (N, A) float32 with 0 there."""
+    if jnp.issubdtype(stored.dtype, jnp.integer):
+        return jnp.where(used, stored.astype(jnp.int32), -1)
+    return jnp.where(used[:, None], stored, 0)

@@ -6,6 +6,7 @@ sampled, and the oldest finished one is overwritten first.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +17,16 @@ from flax import struct
 class StepRecord:
     """What is stored of one step, for a token (a_{t-1}, o_t) and the transition that led to it."""
 
-    observation: jax.Array  # (E, *observation_shape) in the environment's own dtype; or (E,) which of all there are
-    previous_action: jax.Array  # (E,) integer; -1 on the first step of an episode
+    observation: Any  # (E, *observation_shape) in the environment's own dtype; (E,) which of all there are; or the
+    # moment, an EnvState with leaves (E, ...), of an environment that shows it again
+    previous_action: jax.Array  # (E,) integer, -1 on the first step of an episode; or (E, A) float32, there 0
     reward: jax.Array  # (E,) float32, received on arriving
     terminated: jax.Array  # (E,) bool, on arriving
     truncated: jax.Array  # (E,) bool, on arriving
-    z_s: jax.Array | None  # (E, F) phi(s_t), labelled once on collection; None when the agent does not use it
+    z_s: jax.Array | None  # (E, F) phi(s_t), labelled once on collection, or (E, 1 + copies, F) in each copy of the
+    # episode; None when the agent does not use it
     state: jax.Array | None = None  # (E, *state_shape); None but for asymmetric critics
+    symmetry: jax.Array | None = None  # (E, 2) uint32, the same in all steps of an episode: see `mijax.augmentation`
 
 
 @struct.dataclass
@@ -78,6 +82,24 @@ def finish(replay: Replay, done: jax.Array, length: jax.Array) -> Replay:
         finished=replay.finished.at[jnp.where(done, ring, replay.capacity)].set(replay.open_slots, mode="drop"),
         open_slots=jnp.where(done, fresh, replay.open_slots),
         count=replay.count + jnp.sum(done, dtype=jnp.int32),
+    )
+
+
+def fill(replay: Replay, records: StepRecord, length: jax.Array, number: jax.Array) -> Replay:
+    """Put the first () `number` of N whole episodes into a replay in which none has finished yet.
+
+    Args:
+        replay: of a capacity of at least N.
+        records: every field (N, L, ...).
+        length: (N,) int32, steps stored, the first observation included.
+    """
+    slots = replay.open_slots.shape[0] + jnp.arange(length.shape[0], dtype=jnp.int32)
+    return dataclasses.replace(
+        replay,
+        data=jax.tree.map(lambda x, y: x.at[slots].set(y.astype(x.dtype)), replay.data, records),
+        length=replay.length.at[slots].set(length),
+        finished=replay.finished.at[: length.shape[0]].set(slots),
+        count=number.astype(jnp.int32),
     )
 
 

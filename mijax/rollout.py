@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs_mjx.base import Environment, EnvState, TimeStep
-from mijax.agents.dqn import DQN
+from mijax.agents.core import Agent
 from mijax.nets.two_branch import MemoryState
 from mijax.replay import Replay, StepRecord, finish, write
 from mijax.types import Metrics, Params
 
-Recorder = Callable[[TimeStep, jax.Array], StepRecord]
-"""What the replay stores of a step of E environments, from their time steps and (E,) previous actions."""
+Recorder = Callable[..., StepRecord]
+"""What the replay stores of a step of E environments, from their time steps and previous actions, and, where moments
+are stored, their states and the symmetries of their episodes."""
 
 
 @struct.dataclass
@@ -24,9 +25,10 @@ class Episodes:
     env_state: EnvState  # leading axis E
     timestep: TimeStep  # leading axis E
     memory: MemoryState  # leading axis E
-    previous_action: jax.Array  # (E,) int32, -1 at the start
+    previous_action: jax.Array  # (E,) int32, -1 at the start; or (E, A) float32, 0 at the start
     position: jax.Array  # (E,) int32, steps since the start
     returns: jax.Array  # (E,) float32, undiscounted so far
+    symmetry: jax.Array | None = None  # (E, 2) uint32, drawn with the episode: see `mijax.augmentation`
 
 
 @struct.dataclass
@@ -61,22 +63,28 @@ def select(which: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, old)
 
 
-def start_episodes(env: Environment, agent: DQN, num_envs: int, key: jax.Array) -> Episodes:
+def start_episodes(env: Environment, agent: Agent, num_envs: int, key: jax.Array) -> Episodes:
     """Reset every environment."""
     env_state, timestep = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     return Episodes(
         env_state=env_state,
         timestep=timestep,
         memory=agent.initial_memory(num_envs),
-        previous_action=jnp.full((num_envs,), -1, jnp.int32),
+        previous_action=agent.no_action(num_envs),
         position=jnp.zeros((num_envs,), jnp.int32),
         returns=jnp.zeros((num_envs,)),
+        symmetry=draw_symmetry(key, num_envs) if agent.copies else None,
     )
+
+
+def draw_symmetry(key: jax.Array, num: int) -> jax.Array:
+    """(num, 2) uint32, one for each episode; besides it, `key` may draw whatever else it draws."""
+    return jax.random.bits(jax.random.fold_in(key, num), (num, 2), jnp.uint32)
 
 
 def collect_step(
     env: Environment,
-    agent: DQN,
+    agent: Agent,
     params: Params,
     record: Recorder,
     epsilon: jax.Array,
@@ -93,7 +101,7 @@ def collect_step(
     )
     env_state, timestep = jax.vmap(env.step)(jax.random.split(key_env, num_envs), episodes.env_state, action)
     position, returns = episodes.position + 1, episodes.returns + timestep.reward
-    replay = write(replay, record(timestep, action), position)
+    replay = write(replay, record(timestep, action, env_state, episodes.symmetry), position)
     done = timestep.done
     totals = EpisodeTotals(
         totals.episodes + jnp.sum(done, dtype=jnp.int32),
@@ -102,13 +110,13 @@ def collect_step(
         totals.steps + jnp.sum(jnp.where(done, position, 0), dtype=jnp.int32),
     )
     replay = finish(replay, done, position + 1)
-    running = Episodes(env_state, timestep, memory, action, position, returns)
+    running = Episodes(env_state, timestep, memory, action, position, returns, episodes.symmetry)
     episodes = select(done, start_episodes(env, agent, num_envs, key_reset), running)
-    first = record(episodes.timestep, episodes.previous_action)
+    first = record(episodes.timestep, episodes.previous_action, episodes.env_state, episodes.symmetry)
     return episodes, write(replay, first, episodes.position, keep=done), totals
 
 
-def evaluate(env: Environment, agent: DQN, params: Params, num_episodes: int, key: jax.Array) -> Metrics:
+def evaluate(env: Environment, agent: Agent, params: Params, num_episodes: int, key: jax.Array) -> Metrics:
     """Greedy episodes, side by side: per-episode results, each (num_episodes,).
 
     The discounted return is sum_t gamma^t r_{t+1}; `value` is what the agent promises itself of it, and of the bonus,
@@ -133,7 +141,8 @@ def evaluate(env: Environment, agent: DQN, params: Params, num_episodes: int, ke
         success |= ~over & timestep.done & jax.vmap(env.success)(timestep)
         discounted += reward * discount ** episodes.position.astype(jnp.float32)
         position = episodes.position + ~over
-        episodes = Episodes(env_state, timestep, memory, action, position, episodes.returns + reward)
+        episodes = Episodes(
+            env_state, timestep, memory, action, position, episodes.returns + reward, episodes.symmetry)
         return (episodes, over | timestep.done, success, discounted, revealed), None
 
     carry = (episodes, false, false, zero, false)

@@ -17,7 +17,7 @@ import tyro
 import configs
 from configs.paper import paper
 from envs_mjx import registry
-from envs_mjx.base import Environment
+from envs_mjx.base import ContinuousActions, Environment
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of
@@ -153,7 +153,8 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     run = open_run(options)
     if source is not None and needs_representation(config):
         stage1.reuse(source, run, env, seeds)
-    say(f"{run.path}: {title_of(config)} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
+    title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))
+    say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
 
     clock = CompileClock()
     learnt, stage1_seconds = None, {}
@@ -194,7 +195,7 @@ def _loop(
     """Chunks, evaluations, metrics and checkpoints up to the run's steps; False when asked to stop before."""
     config = options.config
     tracker, stop = make_tracker(options.track, run), StopRequest(say)
-    evaluations = 0
+    agent, evaluations = runner.learner.agent, 0
 
     def save() -> None:
         for seed, state in runner.states().items():
@@ -205,7 +206,7 @@ def _loop(
             while runner.step < config.steps and not stop.asked:
                 rows = _advance(runner, config, clock)
                 for seed, row in rows.items():
-                    _refuse_divergence(seed, row, config)
+                    _refuse_divergence(seed, row, agent.group, agent.options.learning_rate)
                     run.append(seed, row)
                     tracker.log(seed, row)
                 progress.update(runner.step, _overview(rows))
@@ -235,7 +236,8 @@ def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[in
     wall = {"compile": compiled + compiled_evaluation, "training": trained - started - compiled,
             "evaluation": ended - trained - compiled_evaluation}
     wall = {f"wall/{part}": max(seconds, 0) * share for part, seconds in wall.items()}
-    update = (runner.step - runner.learner.warmup_steps) // config.iteration_steps * config.updates_per_iteration
+    iterations = (runner.step - runner.learner.warmup_steps) // config.iteration_steps
+    update = iterations * runner.learner.updates_per_iteration
     return {
         seed: {"step": runner.step, "update": update}
         | {f"evaluation/{name}": value for name, value in results[seed].items()} | metrics[seed] | wall
@@ -243,12 +245,12 @@ def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[in
     }
 
 
-def _refuse_divergence(seed: int, row: Mapping[str, float], config: Config) -> None:
+def _refuse_divergence(seed: int, row: Mapping[str, float], group: str, learning_rate: float) -> None:
     bad = [name for name, value in row.items() if name.startswith("loss/") and not np.isfinite(value)]
     if bad:
         raise TrainingError(
             f"seed {seed}: {bad[0]} is {row[bad[0]]} at step {row['step']:,}; go on from the last checkpoint "
-            f"or try a smaller --dqn.learning-rate than {config.dqn.learning_rate}")
+            f"or try a smaller --{group}.learning-rate than {learning_rate}")
 
 
 def _overview(rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:

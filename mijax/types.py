@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mijax.frames import FrameTable
-
 Params = Any
 """A pytree of float32 parameters (Flax linen)."""
 Metrics = dict[str, jax.Array]
@@ -43,9 +41,9 @@ class Tokens:
     Token t of an episode is what was known on arriving at step t: (a_{t-1}, o_t). Padding belongs to segment 0.
     """
 
-    frames: jax.Array | FrameTable  # (R L, *observation_shape)  the observations, or all that there are
+    frames: Any  # (R L, *observation_shape) the observations, a FrameTable of all there are, or moments to be shown
     frame: jax.Array | None  # (R, L) int32, which of all observations a token shows; None when frames are the tokens'
-    previous_action: jax.Array  # (R, L) int32; -1 on the first token of an episode
+    previous_action: jax.Array  # (R, L) int32, -1 on the first token of an episode; or (R, L, A) float32, there 0
     reward: jax.Array  # (R, L) float32, received on arriving
     terminated: jax.Array  # (R, L) bool, on arriving
     truncated: jax.Array  # (R, L) bool, on arriving
@@ -53,6 +51,7 @@ class Tokens:
     position: jax.Array  # (R, L) int32, step within the episode
     z_s: jax.Array | None  # (R, L, F) phi(s_t), or None when the agent does not use it
     states: jax.Array | None = None  # (R L, *state_shape) for asymmetric critics
+    symmetry: jax.Array | None = None  # (R, L, 2) uint32, while frames are moments: see `mijax.augmentation`
 
     def folds(self) -> "tuple[Tokens, Tokens]":
         """The upper and the lower half of the rows: of a batch of `sample_episodes`, its two folds."""

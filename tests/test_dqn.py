@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs_mjx.base import ArraySpec, DiscreteActions, Environment
-from mijax.agents.dqn import DQN, AgentState, make_agent
+from mijax.agents.dqn import DQN, AgentState, make_dqn
 from mijax.config import Config, ConfigError, DQNConfig, InformationConfig, NetworkConfig, Stage1Config
 from mijax.representation.model import init_parameters, networks_for
 from mijax.types import Representation, Tokens
@@ -71,7 +71,7 @@ SPANS = ((0, 0, 4), (0, 4, 6), (1, 0, 5))  # row, first token, end: the three ep
 
 
 def agent_of(config: Config) -> DQN:
-    return make_agent(Shapes(), config)
+    return make_dqn(Shapes(), config)
 
 
 def changed(config: Config, **dqn: Any) -> Config:
@@ -258,4 +258,4 @@ def test_continuous_actions_are_refused():
         action_spec: Any = "continuous"
 
     with pytest.raises(ConfigError, match="continuous actions"):
-        make_agent(Continuous(), CONFIG)
+        make_dqn(Continuous(), CONFIG)

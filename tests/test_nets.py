@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs_mjx.base import ArraySpec, DiscreteActions, Environment
-from mijax.agents.dqn import DQN, make_agent
+from mijax.agents.dqn import DQN, make_dqn
 from mijax.config import Config, MemoryName, NetworkConfig, Stage1Config
 from mijax.frames import FrameTable
 from mijax.nets.gpt import sine_positions
@@ -44,7 +44,7 @@ class Shapes(Environment):
 
 def agent_of(memory: MemoryName, spec: ArraySpec = VECTOR, network: NetworkConfig = TINY) -> DQN:
     config = Config(agent="mi", memory=memory, network=network, stage1=Stage1Config(features=FEATURES))
-    return make_agent(Shapes(spec), config)
+    return make_dqn(Shapes(spec), config)
 
 
 def stored_episodes(spec: ArraySpec = VECTOR) -> Replay:

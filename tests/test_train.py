@@ -166,4 +166,4 @@ def test_a_representation_of_another_domain_is_refused(whole_run: pathlib.Path, 
 
 def test_divergence_is_named() -> None:
     with pytest.raises(RunError, match="seed 3: loss/td is nan at step 400"):
-        train._refuse_divergence(3, {"step": 400, "loss/td": np.nan}, Config())
+        train._refuse_divergence(3, {"step": 400, "loss/td": np.nan}, "dqn", 1e-3)

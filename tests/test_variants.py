@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envs_mjx.base import ArraySpec, DiscreteActions, Environment
-from mijax.agents.dqn import DQN, AgentState, make_agent
+from mijax.agents.dqn import DQN, AgentState, make_dqn
 from mijax.agents.variants import VARIANTS, memory_of, needs_representation, stage1_of, title_of
 from mijax.config import BelieverConfig, Config, ConfigError, DQNConfig, MDPConfig, NetworkConfig, Stage1Config
 from mijax.nets.privileged import StateShown
@@ -69,7 +69,7 @@ class Agent:
     def __init__(self, name: str, **changes: Any) -> None:
         self.config = dataclasses.replace(CONFIG, agent=name, **changes)
         env = StateShown(Shapes()) if name == "mdp" else Shapes()
-        self.dqn: DQN = make_agent(env, self.config)
+        self.dqn: DQN = make_dqn(env, self.config)
         self.tokens = episodes()
         if name == "mdp":
             both = jnp.concatenate([jnp.asarray(self.tokens.states), jnp.asarray(self.tokens.frames)], -1)
@@ -233,7 +233,7 @@ def test_memories():
     assert [memory_of(dataclasses.replace(CONFIG, agent=name)) for name in VARIANTS] == [
         "gpt", "gpt", "gru", "gpt", "gpt", "gpt", "mlp"]
     with pytest.raises(ConfigError, match=r"--memory: got 'gpt', accepted: gru \(--agent zp\)"):
-        make_agent(Shapes(), dataclasses.replace(CONFIG, agent="zp", memory="gpt"))
+        make_dqn(Shapes(), dataclasses.replace(CONFIG, agent="zp", memory="gpt"))
     assert title_of(dataclasses.replace(CONFIG, agent="base", memory="gru")) == "DTQN (GRU)"
     assert title_of(CONFIG) == "Ours"
 

@@ -46,7 +46,8 @@ class RobotTask(Environment):
 
     horizon = 50
     action_spec = ContinuousActions(4, ("x", "y", "z", "turn"))
-    observation_spec = state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
+    observation_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32, blank=1)
+    state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
     opening: scene.Opening
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))

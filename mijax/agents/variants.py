@@ -7,10 +7,12 @@ from mijax.config import Config, ConfigError, CriticInput, MemoryKind, Stage1Con
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """What sets one agent apart on the shared core. All act on Q(h, a) but `mdp`, which sees the state."""
+    """What sets one agent apart on the shared core. All act on the history but `mdp`, which sees the state."""
 
     title: str
-    """Name in figures, with the first of its memories."""
+    """Name in figures on Double DQN, with the first of its memories."""
+    title_sac: str
+    """The same on SAC."""
     summary: str
     """One line for the help text."""
     memories: tuple[MemoryKind, ...] = ("gpt", "gru", "mlp")
@@ -20,7 +22,7 @@ class Variant:
     informed: bool = False
     """The bonus for information on z_s and the auxiliary prediction of z_s."""
     critic: CriticInput | None = None
-    """An asymmetric critic beside Q(h, a), whose target network both bootstrap from."""
+    """An asymmetric critic: with DQN beside Q(h, a), both bootstrapping from its target network; with SAC the only."""
     predicts_itself: bool = False
     """The auxiliary prediction of the next history summary (Eq. 6)."""
     believes: bool = False
@@ -31,19 +33,23 @@ class Variant:
 
 VARIANTS = {
     "mi": Variant(
-        "Ours", "bonus for information on z_s, prediction of z_s, psi in the memoryless branch (Section 3.2)",
+        "Ours", "Ours", "bonus for information on z_s, prediction of z_s, psi in the memoryless branch (Section 3.2)",
         uses_representation=True, informed=True),
-    "base": Variant("DTQN", "the plain two-branch memory agent (Appendix A.1)"),
+    "base": Variant("DTQN", "TSAC", "the plain two-branch memory agent (Appendix A.1)"),
     "zp": Variant(
-        "ZP-DRQN", "predicts its own next history summary (Appendix A.2)", memories=("gru",), predicts_itself=True),
-    "ba": Variant("BA-DTQN", "biased asymmetric: learns Q(s, a) beside Q(h, a) (Appendix A.3)", critic="state"),
+        "ZP-DRQN", "ZP-RSAC", "predicts its own next history summary (Appendix A.2)", memories=("gru",),
+        predicts_itself=True),
+    "ba": Variant(
+        "BA-DTQN", "BA-TSAC", "biased asymmetric: a critic Q(s, a), with DQN beside Q(h, a) (Appendix A.3)",
+        critic="state"),
     "ua": Variant(
-        "UA-DTQN", "unbiased asymmetric: learns Q(h, s, a) beside Q(h, a) (Appendix A.4)", critic="history_state"),
+        "UA-DTQN", "UA-TSAC", "unbiased asymmetric: a critic Q(h, s, a), with DQN beside Q(h, a) (Appendix A.4)",
+        critic="history_state"),
     "believer": Variant(
-        "B-DQN", "Q-learning on samples of a belief over z_s, stage 1 with a KL penalty (Appendix A.5)",
+        "B-DQN", "B-SAC", "learns on samples of a belief over z_s, stage 1 with a KL penalty (Appendix A.5)",
         memories=("gpt", "gru"), uses_representation=True, believes=True),
     "mdp": Variant(
-        "MDP", "no memory; sees the state, or stage 1's features of it: the overlap test (Fig. 4, Fig. 29)",
+        "MDP", "MDP", "no memory; sees the state, or stage 1's features of it: the overlap test (Fig. 4, Fig. 29)",
         memories=("mlp",), uses_representation=True, sees_state=True),
 }
 
@@ -69,11 +75,12 @@ def memory_of(config: Config) -> MemoryKind:
     return config.memory
 
 
-def title_of(config: Config) -> str:
-    """Name in figures: the agent, and its memory when that is not its own."""
+def title_of(config: Config, continuous: bool = False) -> str:
+    """Name in figures: the agent, on SAC where actions are `continuous`, and its memory when that is not its own."""
     declaration = variant(config.agent)
     memory = memory_of(config)
-    return declaration.title + ("" if memory == declaration.memories[0] else f" ({memory.upper()})")
+    title = declaration.title_sac if continuous else declaration.title
+    return title + ("" if memory == declaration.memories[0] else f" ({memory.upper()})")
 
 
 def stage1_of(config: Config) -> Stage1Config:

@@ -1,8 +1,11 @@
 """The agent of Believer: its history reaches Q only through samples of a belief p(z_s | h) (paper Appendix A.5)."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from envs_mjx.base import ArraySpec
 from mijax.config import BelieverConfig
@@ -23,8 +26,16 @@ class _Scalar(nn.Module):
         return self.param("value", nn.initializers.zeros_init(), ())
 
 
-class BeliefQ(nn.Module):
-    """Q(b, o, a), b the mean over samples z_s ~ p(z_s | h) of a learned embedding of each.
+@struct.dataclass
+class Belief:
+    """What the history model says of N = R L tokens."""
+
+    both: jax.Array  # (N, W + F)  the embedded belief beside the features of the observation
+    terms: tuple[jax.Array, ...] | None  # of the VAE's loss: see `Outputs.belief`
+
+
+class BeliefBranches(nn.Module):
+    """b beside psi(o), b the mean over samples z_s ~ p(z_s | h) of a learned embedding of each.
 
     p(z_s | h) is a variational autoencoder: a summary x of the history (Table 2: 16 wide) and a standard normal latent
     (Table 2: 16) decode to z_s, in units of its standard deviation. In gradient passes latents are drawn afresh.
@@ -34,6 +45,7 @@ class BeliefQ(nn.Module):
     observation_spec: ArraySpec
     features: int
     believer: BelieverConfig
+    after_trunk: bool = False  # as in `TwoBranch`
 
     def setup(self) -> None:
         net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
@@ -42,47 +54,73 @@ class BeliefQ(nn.Module):
         self.decoder = MLP(net.auxiliary_hidden, self.features, dtype)
         self.log_scale = _Scalar()
         self.embed_sample = MLP(net.auxiliary_hidden, net.auxiliary_hidden[-1], dtype)
-        self.bottom = encoder_for(self.observation_spec, self.features)
-        self.q_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
+        self.bottom = self.make_bottom()
 
-    def __call__(self, tokens: Tokens, deterministic: bool = True) -> Outputs:
-        """Action values and, where `tokens.z_s` is given in units of its standard deviation, the terms of the VAE."""
+    def make_bottom(self) -> Any:
+        """The encoder of the memoryless branch, of psi's architecture, or its output layer."""
+        if self.after_trunk:
+            return nn.Dense(self.features, dtype=jnp.dtype(self.top.network.dtype))
+        return encoder_for(self.observation_spec, self.features)
+
+    def branches(self, tokens: Tokens, deterministic: bool = True) -> Belief:
+        """The belief and, where `tokens.z_s` is given in units of its standard deviation, the terms of the VAE."""
         x = self.summarise(self.top(tokens, deterministic))
         z_o = frame_features(self.bottom, tokens)
         samples = self.believer.samples
         noise = self._fixed(samples)[None]
         if not deterministic:
             noise = jax.random.normal(self.make_rng("dropout"), (x.shape[0], samples, self.believer.latent_width))
-        shape = tokens.segment.shape
-        q = self._values(x, noise, z_o).reshape(*shape, -1)
+        both, shape = self._embed(x, noise, z_o), tokens.segment.shape
         if tokens.z_s is None:
-            return Outputs(q)
+            return Belief(both, None)
         mean, log_variance = jnp.split(
             self.posterior(jnp.concatenate([x, tokens.z_s.reshape(x.shape[0], -1)], axis=-1)), 2, axis=-1)
         latent = mean + jnp.exp(0.5 * log_variance) * noise[:, 0]
         decoded = self.decoder(jnp.concatenate([x, latent], axis=-1))
         terms = tuple(term.astype(jnp.float32).reshape(*shape, -1) for term in (decoded, mean, log_variance))
-        return Outputs(q, belief=(*terms, self.log_scale()))
+        return Belief(both, (*terms, self.log_scale()))
 
     def initial_state(self, batch: int) -> MemoryState:
         """The memory of `batch` episodes that have not started."""
         return self.top.initial_state(batch)
 
-    def step(
+    def step_branches(
         self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
     ) -> tuple[MemoryState, jax.Array]:
-        """One token for each of (B,) episodes -> new memory, (B, A) action values."""
+        """One token for each of (B,) episodes -> new memory, (B, W + F) belief and features of the observation."""
         state, summary = self.top.step(state, observation, previous_action)
         noise = self._fixed(self.believer.samples)[None]
-        return state, self._values(self.summarise(summary), noise, self.bottom(observation))
+        return state, self._embed(self.summarise(summary), noise, self.bottom(observation))
 
     def _fixed(self, samples: int) -> jax.Array:
         return jax.random.normal(jax.random.key(NOISE_SEED), (samples, self.believer.latent_width))
 
-    def _values(self, x: jax.Array, noise: jax.Array, z_o: jax.Array) -> jax.Array:
-        """(N, X) summaries, (N or 1, K, Z) latents, (N, F) features of the observations -> (N, A)."""
+    def _embed(self, x: jax.Array, noise: jax.Array, z_o: jax.Array) -> jax.Array:
+        """(N, X) summaries, (N or 1, K, Z) latents, (N, F) features of the observations -> (N, W + F)."""
         noise = jnp.broadcast_to(noise, (x.shape[0], *noise.shape[1:])).astype(x.dtype)
         repeated = jnp.broadcast_to(x[:, None], (*noise.shape[:2], x.shape[-1]))
         z_s = self.decoder(jnp.concatenate([repeated, noise], axis=-1))
         belief = jnp.mean(self.embed_sample(z_s), axis=1)
-        return self.q_head(jnp.concatenate([belief, z_o.astype(belief.dtype)], axis=-1)).astype(jnp.float32)
+        return jnp.concatenate([belief, z_o.astype(belief.dtype)], axis=-1)
+
+
+class BeliefQ(BeliefBranches):
+    """Q(b, o, a)."""
+
+    def setup(self) -> None:
+        super().setup()
+        net = self.top.network
+        self.q_head = MLP(net.critic_hidden, self.top.num_actions, jnp.dtype(net.dtype))
+
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> Outputs:
+        """Action values, and the terms of the VAE."""
+        belief = self.branches(tokens, deterministic)
+        q = self.q_head(belief.both).astype(jnp.float32)
+        return Outputs(q.reshape(*tokens.segment.shape, -1), belief=belief.terms)
+
+    def step(
+        self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
+    ) -> tuple[MemoryState, jax.Array]:
+        """One token for each of (B,) episodes -> new memory, (B, A) action values."""
+        state, both = self.step_branches(state, observation, previous_action)
+        return state, self.q_head(both).astype(jnp.float32)

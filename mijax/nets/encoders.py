@@ -44,20 +44,22 @@ class Convolution(nn.Module):
     """A convolution without padding, written as one matrix product: (..., rows, columns, C) -> (..., r, c, channels).
 
     XLA's own convolutions are many times slower on a CPU inside a scan (Sphinx: 5 against 50 updates/s, measured).
-    `kernel` must be a multiple of `stride`: pixels are first gathered in blocks of stride x stride.
+    `kernel` must be a multiple of `stride`: pixels are first gathered in blocks of stride x stride. Of `inputs`
+    channels the last ones may be left out of `x`, where they are always 0: their weights are then not used.
     """
 
     channels: int
     kernel: int
     stride: int
+    inputs: int | None = None  # C where None
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        stride, side = self.stride, self.kernel // self.stride
+        stride, side, shown = self.stride, self.kernel // self.stride, x.shape[-1]
         weights = self.param(
-            "kernel", nn.initializers.lecun_normal(), (self.kernel, self.kernel, x.shape[-1], self.channels))
+            "kernel", nn.initializers.lecun_normal(), (self.kernel, self.kernel, self.inputs or shown, self.channels))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.channels,))
-        weights, bias = weights.astype(x.dtype), bias.astype(x.dtype)
+        weights, bias = weights[..., :shown, :].astype(x.dtype), bias.astype(x.dtype)
         blocks = _gather_blocks(x, stride)
         rows, columns = blocks.shape[-3] - side + 1, blocks.shape[-2] - side + 1
         shifts = [blocks[..., i : i + rows, j : j + columns, :] for i in range(side) for j in range(side)]
@@ -89,22 +91,30 @@ class VectorEncoder(nn.Module):
 
     hidden: tuple[int, ...]
     features: int
+    dtype: jnp.dtype = jnp.float32
     layers = ()  # none that sees a window
 
     def setup(self) -> None:
-        self.blocks = [nn.Dense(width) for width in self.hidden]
-        self.output = nn.Dense(self.features)
+        self.blocks = [nn.Dense(width, dtype=self.dtype) for width in self.hidden]
+        self.output = nn.Dense(self.features, dtype=self.dtype)
 
     def first_block(self, x: Frames) -> jax.Array:
         """(..., D) -> (..., hidden[0]): what the DIM discriminator shares (Fig. 28)."""
         assert isinstance(x, jax.Array)
-        return nn.relu(self.blocks[0](x.astype(jnp.float32)))
+        return nn.relu(self.blocks[0](x.astype(self.dtype)))
 
     def finish(self, h: jax.Array) -> jax.Array:
         """(..., hidden[0]) -> (..., features): all that follows the first block."""
+        return self.output(self._rest(h))
+
+    def body(self, x: Frames) -> jax.Array:
+        """(..., D) -> (..., hidden[-1]): all but the output layer, for several outputs to share."""
+        return self._rest(self.first_block(x))
+
+    def _rest(self, h: jax.Array) -> jax.Array:
         for block in self.blocks[1:]:
             h = nn.relu(block(h))
-        return self.output(h)
+        return h
 
     def __call__(self, x: Frames) -> jax.Array:
         return self.finish(self.first_block(x))
@@ -115,10 +125,14 @@ class ImageEncoder(nn.Module):
 
     plan: tuple[ConvBlock, ...]
     features: int
+    dtype: jnp.dtype = jnp.float32
+    channels: int | None = None  # of the images; of these the last may be left out where they are always 0
 
     def setup(self) -> None:
-        self.blocks = [Convolution(b.channels, b.kernel, b.stride) for b in self.plan]
-        self.output = nn.Dense(self.features)
+        inputs = (self.channels, *(None for _ in self.plan[1:]))
+        self.blocks = [
+            Convolution(b.channels, b.kernel, b.stride, count) for b, count in zip(self.plan, inputs, strict=True)]
+        self.output = nn.Dense(self.features, dtype=self.dtype)
 
     @property
     def layers(self) -> Layers:
@@ -127,7 +141,7 @@ class ImageEncoder(nn.Module):
 
     def _block(self, index: int, x: Frames) -> Frames:
         pool = self.plan[index].pool
-        x = apply_layer(lambda y: nn.relu(self.blocks[index](y.astype(jnp.float32))), x)
+        x = apply_layer(lambda y: nn.relu(self.blocks[index](y.astype(self.dtype))), x)
         return apply_layer(lambda y: _max_pool(y, pool), x) if pool > 1 else x
 
     def first_block(self, x: Frames) -> Frames:
@@ -136,10 +150,17 @@ class ImageEncoder(nn.Module):
 
     def finish(self, h: Frames) -> jax.Array:
         """(..., rows', columns', channels') -> (..., features): all that follows the first block."""
+        return self.output(self._rest(h))
+
+    def body(self, x: Frames) -> jax.Array:
+        """(..., rows, columns, channels) -> (..., D): all but the output layer, for several outputs to share."""
+        return self._rest(self.first_block(x))
+
+    def _rest(self, h: Frames) -> jax.Array:
         for index in range(1, len(self.plan)):
             h = self._block(index, h)
         assert isinstance(h, jax.Array)
-        return self.output(h.reshape(*h.shape[:-3], -1))
+        return h.reshape(*h.shape[:-3], -1)
 
     def __call__(self, x: Frames) -> jax.Array:
         return self.finish(self.first_block(x))
@@ -170,10 +191,10 @@ def _fits(plan: Sequence[ConvBlock], size: int) -> bool:
     return size >= 1
 
 
-def encoder_for(spec: ArraySpec, features: int) -> Encoder:
+def encoder_for(spec: ArraySpec, features: int, dtype: jnp.dtype = jnp.float32) -> Encoder:
     """The encoder of arrays like `spec`: vectors (D,) or images (rows, columns, channels)."""
     if spec.is_image:
-        return ImageEncoder(plan=image_plan(min(spec.shape[:2])), features=features)
+        return ImageEncoder(image_plan(min(spec.shape[:2])), features, dtype, spec.shape[2])
     if len(spec.shape) == 1:
-        return VectorEncoder(hidden=VECTOR_HIDDEN, features=features)
+        return VectorEncoder(hidden=VECTOR_HIDDEN, features=features, dtype=dtype)
     raise ValueError(f"no encoder for arrays of shape {spec.shape}: vectors (D,) and images (rows, columns, channels)")

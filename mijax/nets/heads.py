@@ -7,36 +7,44 @@ import jax
 import jax.numpy as jnp
 
 from mijax.frames import Frames, Patches, apply_layer
-from mijax.nets.encoders import Convolution
+from mijax.nets.encoders import STRIDED_IMAGE_MINIMUM, Convolution, image_plan
 
 
 class MLP(nn.Module):
-    """ReLU layers of `hidden` units, then a linear layer of `features`."""
+    """ReLU layers of `hidden` units, normalised first if `norm`, then a linear layer of `features`."""
 
     hidden: Sequence[int]
     features: int
     dtype: jnp.dtype = jnp.float32
     start_at_zero: bool = False  # the linear layer starts with zeros
+    norm: bool = False
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for width in self.hidden:
-            x = nn.relu(nn.Dense(width, dtype=self.dtype)(x))
+            x = nn.Dense(width, dtype=self.dtype)(x)
+            x = nn.relu(nn.LayerNorm(dtype=self.dtype)(x) if self.norm else x)
         last = nn.initializers.zeros if self.start_at_zero else nn.initializers.lecun_normal()
         return nn.Dense(self.features, kernel_init=last, dtype=self.dtype)(x)
 
 
 class ObservationEmbedder(nn.Module):
-    """N observations -> (N, features): Linear + ReLU, after two small convolutions for images."""
+    """N observations -> (N, features): Linear + ReLU, after two small convolutions for images.
+
+    Images as large as the robots' go through the strided convolutions of Fig. 27 instead.
+    """
 
     features: int
     dtype: jnp.dtype = jnp.float32
-    layers = ((2, 1), (2, 1))  # of images; not used on vectors
+    layers = ((2, 1), (2, 1))  # of images that are not large; not used on vectors
 
     @nn.compact
     def __call__(self, observation: Frames) -> jax.Array:
         x = observation
-        if isinstance(x, Patches) or x.ndim == 4:
+        if isinstance(x, jax.Array) and x.ndim == 4 and min(x.shape[1:3]) >= STRIDED_IMAGE_MINIMUM:
+            for block in image_plan(min(x.shape[1:3])):
+                x = nn.relu(Convolution(block.channels, block.kernel, block.stride)(x.astype(self.dtype)))
+        elif isinstance(x, Patches) or x.ndim == 4:
             for channels, (kernel, stride) in zip((8, 16), self.layers, strict=True):
                 convolution = Convolution(channels, kernel, stride)
                 x = apply_layer(lambda y, conv=convolution: nn.relu(conv(y.astype(self.dtype))), x)
@@ -44,8 +52,15 @@ class ObservationEmbedder(nn.Module):
         return nn.relu(nn.Dense(self.features, dtype=self.dtype)(x.reshape(x.shape[0], -1).astype(self.dtype)))
 
 
+def action_vector(action: jax.Array, num_actions: int, dtype: jnp.dtype) -> jax.Array:
+    """What a network sees of an action: (N,) integers -> (N, A) one-hot, 0 for -1 (none); (N, A) floats as they are."""
+    if jnp.issubdtype(action.dtype, jnp.integer):
+        return jax.nn.one_hot(action, num_actions, dtype=dtype)
+    return action.astype(dtype)
+
+
 class ActionEmbedder(nn.Module):
-    """(...) int32 actions, -1 for none -> (..., features)."""
+    """(N,) integer or (N, A) float actions -> (N, features)."""
 
     num_actions: int
     features: int
@@ -53,5 +68,5 @@ class ActionEmbedder(nn.Module):
 
     @nn.compact
     def __call__(self, action: jax.Array) -> jax.Array:
-        one_hot = jax.nn.one_hot(action, self.num_actions, dtype=self.dtype)
-        return nn.relu(nn.Dense(self.features, dtype=self.dtype)(one_hot))
+        seen = action_vector(action, self.num_actions, self.dtype)
+        return nn.relu(nn.Dense(self.features, dtype=self.dtype)(seen))

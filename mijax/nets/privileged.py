@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from envs_mjx.base import ArraySpec, Environment, EnvState, TimeStep
+from envs_mjx.base import ArraySpec, Demonstrations, Environment, EnvState, TimeStep
 from mijax.config import ConfigError, NetworkConfig, PrivilegedInput
 from mijax.nets.encoders import encoder_for
 from mijax.nets.heads import MLP
@@ -47,35 +47,58 @@ class StateShown(Environment):
         """As the environment does."""
         return self._env.reveals(env_state)
 
+    def show(self, env_state: EnvState) -> TimeStep:
+        """As the environment does."""
+        return self._show(env_state, self._env.show(env_state))[1]
+
+    def demonstrations(self, key: jax.Array, number: int) -> Demonstrations | None:
+        """As the environment does."""
+        return self._env.demonstrations(key, number)
+
+    def augment(self, key: jax.Array, env_state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+        """As the environment does."""
+        return self._env.augment(key, env_state, action)
+
     @staticmethod
     def _show(env_state: EnvState, timestep: TimeStep) -> tuple[EnvState, TimeStep]:
         both = jnp.concatenate([timestep.state, timestep.observation], axis=-1)
         return env_state, timestep.replace(observation=both)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class PrivilegedQ(nn.Module):
-    """Q(x, a) of x = z_s, z_s + z_o (frozen features of stage 1) or s (an encoder of its own)."""
+class PrivilegedFeatures(nn.Module):
+    """z_s, z_s + z_o (frozen features of stage 1) or features of s (an encoder of its own)."""
 
-    num_actions: int
     state_spec: ArraySpec
     observation_spec: ArraySpec  # the state's entries, then the observation's, along the last axis
     features: int
     sees: PrivilegedInput
-    network: NetworkConfig
 
     def setup(self) -> None:
         self.phi = encoder_for(self.state_spec, self.features)
         own = (*self.observation_spec.shape[:-1], self.observation_spec.shape[-1] - self.state_spec.shape[-1])
         self.psi = encoder_for(ArraySpec(own, self.observation_spec.dtype), self.features)
-        self.q_head = MLP(self.network.critic_hidden, self.num_actions, jnp.dtype(self.network.dtype))
 
-    def _values(self, both: jax.Array) -> jax.Array:
+    def see(self, both: jax.Array) -> jax.Array:
+        """(N, *observation_shape) -> (N, F) or (N, 2 F)"""
         state, observation = jnp.split(both, [self.state_spec.shape[-1]], axis=-1)
         z_s, z_o = self.phi(state), self.psi(observation)
         if self.sees == "state":
-            return self.q_head(z_s).astype(jnp.float32)
-        seen = z_s if self.sees == "z_s" else jnp.concatenate([z_s, z_o], axis=-1)
-        return self.q_head(jax.lax.stop_gradient(seen)).astype(jnp.float32)
+            return z_s
+        return jax.lax.stop_gradient(z_s if self.sees == "z_s" else jnp.concatenate([z_s, z_o], axis=-1))
+
+
+class PrivilegedQ(PrivilegedFeatures):
+    """Q(x, a) of those features."""
+
+    num_actions: int
+    network: NetworkConfig
+
+    def setup(self) -> None:
+        super().setup()
+        self.q_head = MLP(self.network.critic_hidden, self.num_actions, jnp.dtype(self.network.dtype))
+
+    def _values(self, both: jax.Array) -> jax.Array:
+        return self.q_head(self.see(both)).astype(jnp.float32)
 
     def __call__(self, tokens: Tokens, deterministic: bool = True) -> Outputs:
         """Action values at every token."""

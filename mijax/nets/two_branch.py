@@ -13,7 +13,7 @@ from mijax.frames import FrameTable, keep_present, take
 from mijax.nets.encoders import Encoder, encoder_for
 from mijax.nets.gpt import GPT
 from mijax.nets.gru import GRU
-from mijax.nets.heads import MLP, ActionEmbedder, ObservationEmbedder
+from mijax.nets.heads import MLP, ActionEmbedder, ObservationEmbedder, action_vector
 from mijax.types import Tokens
 
 LONG_LIST = 256
@@ -26,6 +26,11 @@ class MemoryState:
 
     position: jax.Array  # (B,) int32, tokens seen so far
     recurrent: Any  # keys and values of the GPT, or the hidden state of the GRU
+
+
+def flat(x: jax.Array) -> jax.Array:
+    """(R, L, ...) -> (R L, ...)"""
+    return x.reshape(-1, *x.shape[2:])
 
 
 def frame_features(encoder: ObservationEmbedder | Encoder, tokens: Tokens) -> jax.Array:
@@ -59,7 +64,7 @@ class HistoryEncoder(nn.Module):
     Without memory (`mlp`) it is the embedded observation of the moment.
     """
 
-    num_actions: int
+    num_actions: int  # kinds of discrete actions, or the size of continuous ones
     max_length: int
     memory: MemoryKind
     network: NetworkConfig
@@ -81,7 +86,7 @@ class HistoryEncoder(nn.Module):
         observation = frame_features(self.embed_observation, tokens)
         if self.memory == "mlp":
             return nn.relu(self.present(observation))
-        x = jnp.concatenate([self.embed_action(tokens.previous_action.reshape(-1)), observation], axis=-1)
+        x = jnp.concatenate([self.embed_action(flat(tokens.previous_action)), observation], axis=-1)
         return self.sequence(x, tokens.segment, tokens.position, deterministic)
 
     def initial_state(self, batch: int) -> MemoryState:
@@ -110,8 +115,18 @@ def _state_head(network: NetworkConfig, features: int) -> MLP:
     return MLP(network.auxiliary_hidden, features, jnp.dtype(network.dtype), start_at_zero=True)
 
 
-class TwoBranchQ(nn.Module):
-    """Q(h, a) from a memory branch over the history and a memoryless branch over the observation."""
+@struct.dataclass
+class Branches:
+    """What both branches say of N = R L tokens; None where there is no such head."""
+
+    both: jax.Array  # (N, W + F)  the memory branch beside the memoryless one
+    summary: jax.Array  # (N, W)  of the history
+    z_s: jax.Array | None  # (N, F)  predicted from the history, in units of its standard deviation
+    next_summary: jax.Array | None  # (N, W)  predicted summary after the action that was taken next
+
+
+class TwoBranch(nn.Module):
+    """A memory branch over the history beside a memoryless branch over the observation, and the heads of both."""
 
     top: HistoryEncoder
     observation_spec: ArraySpec
@@ -119,62 +134,89 @@ class TwoBranchQ(nn.Module):
     bottom_psi: bool  # the memoryless branch has psi's architecture, so that it can start from it
     predicts_state: bool = False  # the memory branch has a head that predicts z_s (the auxiliary task)
     predicts_itself: bool = False  # and one that predicts its own next summary (Eq. 6)
-    critic: CriticInput | None = None  # an asymmetric critic of s, or of h, o and s
-    state_spec: ArraySpec | None = None  # what the critic sees
+    after_trunk: bool = False  # observations come as features of psi's body: only its output layer is left to do
 
     def setup(self) -> None:
         net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
-        if self.bottom_psi:
-            self.bottom = encoder_for(self.observation_spec, self.features)
-        else:
-            self.bottom = _own_encoder(self.observation_spec, dtype)
-        self.q_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
+        self.bottom = self.make_bottom()
         if self.predicts_state:
             self.state_head = _state_head(net, self.features)
         if self.predicts_itself:
             width = net.gru_width
             self.next_head = MLP((width,), width, dtype)
-        if self.critic is not None:
-            assert self.state_spec is not None
-            self.state_encoder = _own_encoder(self.state_spec, dtype)
-            self.critic_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
 
-    def __call__(self, tokens: Tokens, deterministic: bool = True) -> Outputs:
-        """Action values, and what the other heads say."""
+    def make_bottom(self) -> Any:
+        """The encoder of the memoryless branch: psi's, or one of the agent's own."""
+        if self.bottom_psi and self.after_trunk:
+            return nn.Dense(self.features, dtype=jnp.dtype(self.top.network.dtype))
+        if self.bottom_psi:
+            return encoder_for(self.observation_spec, self.features)
+        return own_encoder(self.observation_spec, jnp.dtype(self.top.network.dtype))
+
+    def branches(self, tokens: Tokens, deterministic: bool = True) -> Branches:
+        """Both branches, and what the heads of the memory branch say."""
         summary = self.top(tokens, deterministic)
         z_o = frame_features(self.bottom, tokens)
         both = jnp.concatenate([summary, z_o.astype(summary.dtype)], axis=-1)
-        z_s = next_summary = critic = None
+        z_s = next_summary = None
         if self.predicts_state:
             z_s = self.state_head(summary)
         if self.predicts_itself:
-            taken = jnp.roll(tokens.previous_action, -1, axis=1).reshape(-1)
-            action = jax.nn.one_hot(taken, self.top.num_actions, dtype=summary.dtype)
+            taken = flat(jnp.roll(tokens.previous_action, -1, axis=1))
+            action = action_vector(taken, self.top.num_actions, summary.dtype)
             next_summary = self.next_head(jnp.concatenate([summary, action], axis=-1))
-        if self.critic is not None:
-            state = self.state_encoder(cast(jax.Array, tokens.states))
-            seen = state if self.critic == "state" else jnp.concatenate([both, state], axis=-1)
-            critic = self.critic_head(seen)
-
-        def of_tokens(x: jax.Array) -> jax.Array:
-            return x.astype(jnp.float32).reshape(*tokens.segment.shape, -1)
-
-        return jax.tree.map(of_tokens, Outputs(self.q_head(both), summary, z_s, critic, next_summary))
+        return Branches(both, summary, z_s, next_summary)
 
     def initial_state(self, batch: int) -> MemoryState:
         """The memory of `batch` episodes that have not started."""
         return self.top.initial_state(batch)
 
+    def step_branches(
+        self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
+    ) -> tuple[MemoryState, jax.Array]:
+        """One token for each of (B,) episodes -> new memory, (B, W + F) both branches."""
+        state, summary = self.top.step(state, observation, previous_action)
+        return state, jnp.concatenate([summary, self.bottom(observation).astype(summary.dtype)], axis=-1)
+
+
+class TwoBranchQ(TwoBranch):
+    """Q(h, a) from both branches."""
+
+    critic: CriticInput | None = None  # an asymmetric critic of s, or of h, o and s
+    state_spec: ArraySpec | None = None  # what the critic sees
+
+    def setup(self) -> None:
+        super().setup()
+        net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)
+        self.q_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
+        if self.critic is not None:
+            assert self.state_spec is not None
+            self.state_encoder = own_encoder(self.state_spec, dtype)
+            self.critic_head = MLP(net.critic_hidden, self.top.num_actions, dtype)
+
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> Outputs:
+        """Action values, and what the other heads say."""
+        seen, critic = self.branches(tokens, deterministic), None
+        if self.critic is not None:
+            state = self.state_encoder(cast(jax.Array, tokens.states))
+            critic = self.critic_head(
+                state if self.critic == "state" else jnp.concatenate([seen.both, state], axis=-1))
+
+        def of_tokens(x: jax.Array) -> jax.Array:
+            return x.astype(jnp.float32).reshape(*tokens.segment.shape, -1)
+
+        return jax.tree.map(
+            of_tokens, Outputs(self.q_head(seen.both), seen.summary, seen.z_s, critic, seen.next_summary))
+
     def step(
         self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
     ) -> tuple[MemoryState, jax.Array]:
         """One token for each of (B,) episodes -> new memory, (B, A) action values."""
-        state, summary = self.top.step(state, observation, previous_action)
-        z_o = self.bottom(observation).astype(summary.dtype)
-        return state, self.q_head(jnp.concatenate([summary, z_o], axis=-1)).astype(jnp.float32)
+        state, both = self.step_branches(state, observation, previous_action)
+        return state, self.q_head(both).astype(jnp.float32)
 
 
-def _own_encoder(spec: ArraySpec, dtype: jnp.dtype) -> ObservationEmbedder:
+def own_encoder(spec: ArraySpec, dtype: jnp.dtype) -> ObservationEmbedder:
     """The memoryless branch of an agent that does not start from psi, and the state's of an asymmetric critic."""
     return ObservationEmbedder(100 if spec.is_image else 128, dtype)
 

@@ -1,0 +1,65 @@
+"""Copies of an episode in worlds that a symmetry of the task has moved (paper Appendix F), made when it is sampled.
+
+The replay stores moments, some hundred bytes each; frames are rendered at sampling. Turning and rendering a moment of
+Block-Pulling takes less time than turning its stored image (`envs_mjx.robot.task.RobotTask.augment`), and is exact.
+"""
+
+import dataclasses
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+
+from envs_mjx.base import Environment, EnvState, TimeStep
+from mijax.types import Tokens
+
+
+def shows_again(env: Environment) -> bool:
+    """Whether the environment can show a moment again, so that moments can be stored in place of frames."""
+    env_state, _ = jax.eval_shape(env.reset, jax.random.key(0))
+    try:
+        jax.eval_shape(env.show, env_state)
+    except (NotImplementedError, TypeError):  # a user's method of that name may be another
+        return False
+    return True
+
+
+def show_copy(
+    env: Environment, symmetry: jax.Array, copy: jax.Array, env_state: EnvState, action: jax.Array
+) -> tuple[TimeStep, jax.Array]:
+    """What one moment shows in one copy of its episode, and the action (A,) that led to it there.
+
+    Args:
+        env: shows moments again.
+        symmetry: (2,) uint32, drawn once per episode; draws the symmetry of each of its copies.
+        copy: () int32; copy 0 is the episode as it was.
+    """
+    key = jax.random.fold_in(jax.random.wrap_key_data(symmetry), copy)
+    moved = env.augment(key, env_state, action)
+    env_state, action = jax.tree.map(lambda a, b: jnp.where(copy == 0, a, b), (env_state, action), moved)
+    return env.show(env_state), action
+
+
+def show_tokens(env: Environment, tokens: Tokens, copies: int, batch: int, key: jax.Array, states: bool) -> Tokens:
+    """Tokens of `batch` episodes with frames in place of moments; each episode in one of its copies, drawn uniformly.
+
+    Args:
+        tokens: their frames are moments, leaves (R L, ...); with `copies`, their z_s are (R, L, 1 + copies, F).
+        copies: besides the original.
+        states: whether the states are wanted too.
+    """
+    flat = tokens.previous_action.reshape(-1, *tokens.previous_action.shape[2:])
+    if copies == 0:
+        timestep, action, z_s = jax.vmap(env.show)(tokens.frames), flat, tokens.z_s
+    else:
+        drawn = jax.random.randint(key, (batch,), 0, copies + 1, jnp.int32)
+        copy = drawn[jnp.maximum(tokens.segment - 1, 0)]
+        symmetry = cast(jax.Array, tokens.symmetry).reshape(-1, 2)
+        timestep, action = jax.vmap(lambda *moment: show_copy(env, *moment))(
+            symmetry, copy.reshape(-1), tokens.frames, flat)
+        z_s = tokens.z_s
+        if z_s is not None:
+            z_s = jnp.take_along_axis(z_s, copy[..., None, None], axis=2)[:, :, 0]
+    return dataclasses.replace(
+        tokens, frames=timestep.observation, previous_action=action.reshape(tokens.previous_action.shape), z_s=z_s,
+        states=timestep.state if states else None, symmetry=None)

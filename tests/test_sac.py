@@ -1,0 +1,444 @@
+"""The SAC core: its losses against loops and quadrature, what its networks see, its replay, and whether it learns."""
+
+import dataclasses
+import inspect
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compass import Compass
+from scipy import integrate, stats
+
+from envs_mjx.base import ArraySpec, ContinuousActions, Environment
+from mijax.agents.core import AgentState
+from mijax.agents.factory import make_agent
+from mijax.agents.sac import SAC
+from mijax.agents.variants import VARIANTS, needs_representation, title_of
+from mijax.config import (
+    BelieverConfig,
+    Config,
+    ConfigError,
+    EvaluationConfig,
+    InformationConfig,
+    NetworkConfig,
+    SACConfig,
+    Stage1Config,
+)
+from mijax.learner import LearnerState, make_learner
+from mijax.losses import sac
+from mijax.nets.privileged import StateShown
+from mijax.packing import one_per_row
+from mijax.representation.model import init_parameters, networks_for
+from mijax.types import Representation, Tokens
+
+ACTIONS, FEATURES, ROW, GAMMA = 2, 4, 6, 0.9
+TINY = NetworkConfig(action_embedding=4, observation_embedding=4, gru_width=8, critic_hidden=(16,), actor_hidden=(16,),
+                     auxiliary_hidden=(16,), dropout=0.0)
+CONFIG = Config(
+    stage1=Stage1Config(features=FEATURES), network=TINY, believer=BelieverConfig(samples=5, updates=2),
+    sac=SACConfig(discount=GAMMA, target_rate=0.1, batch_episodes=8, critic_norm=False), num_envs=2,
+    steps_per_iteration=3, evaluation=EvaluationConfig(every=12),
+    information=InformationConfig(intrinsic_weight=0.5, auxiliary_weight=0.25))
+
+
+class Shapes(Environment):
+    """Nothing but shapes."""
+
+    name, horizon, action_spec = "shapes", ROW - 1, ContinuousActions(ACTIONS)
+    observation_spec, state_spec = ArraySpec((2,)), ArraySpec((3,))
+
+    def reset(self, key):
+        return jnp.zeros(()), None
+
+    def step(self, key, env_state, action):
+        raise NotImplementedError
+
+
+def representation(env: Environment) -> Representation:
+    """Untrained encoders, a mean that is not 0 and a variance that is not 1."""
+    zeros = [jnp.zeros((1, *spec.shape)) for spec in (env.state_spec, env.observation_spec)]
+    parameters = init_parameters(networks_for(env, FEATURES), jax.random.key(5), *zeros)
+    return Representation(parameters["phi"], parameters["psi"], jnp.arange(FEATURES, dtype=jnp.float32), jnp.float32(2))
+
+
+def episodes() -> Tokens:
+    """Row 0: episodes of 3 steps and of 1 step, both terminated; row 1: one of 4 steps, truncated, and padding."""
+    rng = np.random.default_rng(0)
+    segment = np.array([[1, 1, 1, 1, 2, 2], [3, 3, 3, 3, 3, 0]])
+    position = np.array([[0, 1, 2, 3, 0, 1], [0, 1, 2, 3, 4, 0]])
+    terminated, truncated = np.zeros((2, *segment.shape), bool)
+    terminated[0, 3] = terminated[0, 5] = truncated[1, 4] = True
+    action = np.where(position[..., None] == 0, 0, rng.uniform(-0.9, 0.9, (*segment.shape, ACTIONS)))
+    return Tokens(
+        frames=jnp.asarray(rng.normal(size=(segment.size, 2)), jnp.float32), frame=None,
+        previous_action=jnp.asarray(action, jnp.float32),
+        reward=jnp.asarray(rng.normal(size=segment.shape), jnp.float32),
+        terminated=jnp.asarray(terminated), truncated=jnp.asarray(truncated), segment=jnp.asarray(segment, jnp.int32),
+        position=jnp.asarray(position, jnp.int32),
+        z_s=jnp.asarray(rng.normal(size=(*segment.shape, FEATURES)), jnp.float32),
+        states=jnp.asarray(rng.normal(size=(segment.size, 3)), jnp.float32))
+
+
+SPANS = ((0, 0, 4), (0, 4, 6), (1, 0, 5))  # row, first token, end: the three episodes
+
+
+class Case:
+    """An agent with large random parameters, those of its target network different."""
+
+    def __init__(self, name: str, **changes: Any) -> None:
+        self.config = dataclasses.replace(CONFIG, agent=name, **changes)
+        env = StateShown(Shapes()) if name == "mdp" else Shapes()
+        agent = make_agent(env, self.config)
+        assert isinstance(agent, SAC)
+        self.sac, self.tokens = agent, episodes()
+        if name == "mdp":
+            both = jnp.concatenate([jnp.asarray(self.tokens.states), jnp.asarray(self.tokens.frames)], -1)
+            self.tokens = dataclasses.replace(self.tokens, frames=both)
+        self.representation = representation(Shapes()) if needs_representation(self.config) else None
+        shapes, rng = jax.eval_shape(self.sac.init, jax.random.key(0), self.representation), np.random.default_rng(7)
+        params, target = jax.tree.map(
+            lambda x: jnp.asarray(rng.normal(0, 0.3, x.shape), x.dtype), (shapes.params, shapes.target))
+        params["log_temperature"] = jnp.log(jnp.float32(0.3))
+        self.state = AgentState(params, target, self.sac.optimizer.init(params), jnp.zeros((), jnp.int32))
+
+    def says(self, params: Any, tokens: Tokens, action: Any) -> tuple[Any, ...]:
+        """The policy's mean and log scale (R, L, A), both critics' values (2, R, L) of (R, L, A) actions, the heads."""
+        def run(params: Any, tokens: Tokens, action: jax.Array) -> tuple[Any, ...]:
+            encoded = self.sac._encode(params, self.sac.look(params, tokens))
+            mean, log_scale = self.sac._call("policy", params, encoded.actor)
+            values = self.sac._call("values", params, encoded.critic, action.reshape(-1, ACTIONS))
+            shape = tokens.segment.shape
+            return mean.reshape(*shape, -1), log_scale.reshape(*shape, -1), values.reshape(2, *shape), encoded.heads
+
+        return jax.jit(run)(params, tokens, jnp.asarray(action))
+
+    def losses(self) -> tuple[float, dict[str, float]]:
+        loss, metrics = jax.jit(self.sac.loss)(
+            self.state.params, self.state.target, self.tokens, self.representation, jax.random.key(0))
+        return float(loss), {name: float(value) for name, value in metrics.items()}
+
+
+# The losses
+
+
+@pytest.mark.parametrize(("mean", "log_scale"), [(0.0, 0.0), (0.7, -1.0), (-2.0, 0.5)])
+def test_density_of_the_squashed_gaussian(mean: float, log_scale: float):
+    """Against the change of variables by scipy, and it integrates to 1."""
+    def density(action: float) -> float:
+        before = np.arctanh(action)
+        return float(stats.norm.pdf(before, mean, np.exp(log_scale)) / (1 - action**2))
+
+    total, _ = integrate.quad(density, -1, 1, limit=200)
+    assert total == pytest.approx(1, abs=1e-4)
+    for noise in (-1.5, 0.0, 0.8):
+        action, log_prob = sac.sample_tanh_gaussian(*(jnp.array([x], jnp.float32) for x in (mean, log_scale, noise)))
+        assert float(action[0]) == pytest.approx(np.tanh(mean + np.exp(log_scale) * noise), rel=1e-5)
+        assert float(log_prob) == pytest.approx(np.log(density(float(action[0]))), rel=1e-3, abs=1e-3)
+
+
+def test_density_far_in_the_tails_is_finite():
+    far = jnp.array([30.0, -30.0], jnp.float32)
+    np.testing.assert_allclose(sac.log_slope_of_tanh(far), 2 * np.log(2) - 2 * np.abs(far), rtol=1e-6)
+
+
+def test_temperature_loss_pulls_the_entropy_to_its_target():
+    def gradient(entropy: float) -> float:
+        log_prob, mask = jnp.full((3,), -entropy), jnp.ones((3,), bool)
+        return float(jax.grad(lambda x: sac.temperature_loss(x, log_prob, -2.0, mask)[0])(jnp.float32(-1.0)))
+
+    assert gradient(-3.0) < 0  # too little entropy: the temperature rises
+    assert gradient(-1.0) > 0
+    assert gradient(-2.0) == pytest.approx(0)
+
+
+def draws(key: jax.Array) -> Any:
+    """The standard normal noise of the actor's draws for all tokens."""
+    return np.asarray(jax.random.normal(key, (2 * ROW, ACTIONS))).reshape(2, ROW, ACTIONS)
+
+
+def drawn_by_hand(mean: Any, log_scale: Any, noise: Any) -> tuple[np.ndarray, np.ndarray]:
+    before = np.asarray(mean) + np.exp(log_scale) * noise
+    log_prob = stats.norm.logpdf(before, mean, np.exp(log_scale)) + 2 * np.log(np.cosh(before))
+    return np.tanh(before).astype(np.float32), log_prob.sum(-1)
+
+
+@pytest.mark.parametrize(("name", "bootstrap", "trace_decay"), [("base", False, 0.0), ("mi", True, 0.7)])
+def test_losses_by_hand(name: str, bootstrap: bool, trace_decay: float):
+    options = dataclasses.replace(CONFIG.sac, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay)
+    case = Case(name, sac=options)
+    tokens, params, agent = jax.device_get(case.tokens), case.state.params, case.state.params["agent"]
+    _, _, key_action, key_next = jax.random.split(jax.random.key(0), 4)
+    taken = np.roll(tokens.previous_action, -1, axis=1)
+    mean, log_scale, q, heads = case.says(agent, case.tokens, taken)
+    action, log_prob = drawn_by_hand(mean, log_scale, draws(key_action))
+    next_action, next_log_prob = drawn_by_hand(mean, log_scale, draws(key_next))
+    q_drawn = np.asarray(case.says(agent, case.tokens, action)[2])
+    # The target critics look through the online trunk: frames are encoded once.
+    mixed = case.state.target | {"trunk": agent["trunk"]}
+    q_next = np.asarray(case.says(mixed, case.tokens, next_action)[2]).min(0)
+    bonus = np.zeros((2, ROW))
+    expected = {}
+    if name == "mi":
+        scale = lambda x: np.arange(FEATURES) + np.sqrt(2) * np.asarray(x)  # noqa: E731
+        looked = jax.jit(case.sac.look)(agent, case.tokens)
+        model: Any = case.sac.information_model
+        f, z = scale(jax.jit(model.apply)({"params": params["f"][0]}, looked)), tokens.z_s
+        real = tokens.segment > 0
+        expected["loss/f"] = np.sum((z - f) ** 2, -1)[real].mean() / 2
+        expected["loss/auxiliary"] = np.mean(
+            [np.sum((z - scale(head.z_s)) ** 2, -1)[real].mean() / 2 for head in heads])
+        for row, first, end in SPANS:
+            for t in range(first + 1, end):
+                before, after = (np.sum((z[row, t] - f[row, i]) ** 2) for i in (t - 1, t))
+                bonus[row, t] = 0.5 * (before - after) / 2
+    errors, advantages, entropies = [], [], []
+    for row, first, end in SPANS:
+        later = 0.0
+        for t in reversed(range(first + 1, end)):  # the transition that arrives at token t
+            soft = q_next[row, t] - 0.3 * next_log_prob[row, t]
+            ended = tokens.terminated[row, t] or (tokens.truncated[row, t] and not bootstrap)
+            trace = trace_decay if t + 1 < end else 0.0
+            future = 0.0 if ended else GAMMA * ((1 - trace) * soft + trace * later)
+            later = tokens.reward[row, t] + bonus[row, t] + future
+            errors.append(np.sum((later - np.asarray(q)[:, row, t - 1]) ** 2))
+            advantages.append(0.3 * log_prob[row, t - 1] - q_drawn[:, row, t - 1].min())
+            entropies.append(-log_prob[row, t - 1])
+    loss, metrics = case.losses()
+    expected |= {"loss/td": np.mean(errors), "loss/actor": np.mean(advantages), "actor/entropy": np.mean(entropies)}
+    for part, value in expected.items():
+        assert metrics[part] == pytest.approx(value, rel=2e-3, abs=1e-5), part
+    total = expected["loss/td"] + expected["loss/actor"] + np.log(0.3) * (np.mean(entropies) + ACTIONS)
+    if name == "mi":  # the auxiliary loss of both branches
+        total += expected["loss/f"] + 0.25 * 2 * expected["loss/auxiliary"]
+    assert loss == pytest.approx(total, rel=2e-3)
+
+
+def test_who_learns_from_what():
+    """The actor's loss moves the actor alone; the critics' the trunk too; f learns from its own loss only."""
+    case = Case("mi")
+
+    @jax.jit
+    def gradients(params: Any) -> dict[str, Any]:
+        def part(params: Any, name: str) -> jax.Array:
+            arguments = case.state.target, case.tokens, case.representation, jax.random.key(0)
+            return case.sac.loss(params, *arguments)[1][name]
+
+        return {name: jax.grad(part)(params, name) for name in ("loss/actor", "loss/td", "loss/f", "loss/auxiliary")}
+
+    def moved(tree: Any) -> set[str]:
+        parts = tree["agent"] | {"f": tree["f"]}
+        return {name for name, part in parts.items() if any(np.any(x) for x in jax.tree.leaves(part))}
+
+    found = {name: moved(tree) for name, tree in jax.device_get(gradients(case.state.params)).items()}
+    assert found == {
+        "loss/actor": {"actor", "policy_head"}, "loss/td": {"trunk", "critic", "value_heads_0", "value_heads_1"},
+        "loss/f": {"f"}, "loss/auxiliary": {"trunk", "actor", "critic"}}
+
+
+@pytest.mark.lenient
+def test_every_module_of_believer_is_trained():
+    case = Case("believer")
+    after, _ = jax.jit(case.sac.update)(case.state, case.tokens, case.representation, jax.random.key(0))
+    still = jax.tree.map(lambda x, y: bool((x == y).all()), after.params["agent"], case.state.params["agent"])
+    assert not any(jax.tree.leaves(still))
+
+
+# What the networks see
+
+SEEN = {  # agent: what the actor's choice at the last token of an episode depends on, and the critics
+    "mi": ("past present", "past present"), "base": ("past present", "past present"),
+    "zp": ("past present", "past present"), "ba": ("past present", "state"),
+    "ua": ("past present", "past present state"), "believer": ("past present", "past present"),
+    "mdp": ("present state", "present state"),
+}
+
+
+@pytest.mark.parametrize("shared_trunk", [True, False])
+@pytest.mark.parametrize("name", VARIANTS)
+def test_what_each_network_sees(name: str, shared_trunk: bool):
+    case = Case(name, sac=dataclasses.replace(CONFIG.sac, shared_trunk=shared_trunk))
+    t, zero = 3, jnp.zeros((2, ROW, ACTIONS))  # the last token of the first episode of row 0
+    shown = 3 if name == "mdp" else 0  # entries of the state in an observation
+    frames, states = np.array(case.tokens.frames), np.array(case.tokens.states)
+    past, present, state, state_frames = frames.copy(), frames.copy(), states.copy(), frames.copy()
+    past[1], present[t, shown:], state[t], state_frames[t, :shown] = 5, 5, 5, 5
+    changes = {"past": {"frames": past}, "present": {"frames": present},
+               "state": {"states": state, "frames": state_frames}}
+    agent = case.state.params["agent"]
+    before = case.says(agent, case.tokens, zero)
+    actor, critic = set(), set()
+    for what, change in changes.items():
+        changed = dataclasses.replace(case.tokens, **{k: jnp.asarray(v) for k, v in change.items()})
+        after = case.says(agent, changed, zero)
+        if not np.array_equal(before[0][0, t], after[0][0, t]):
+            actor.add(what)
+        if not np.array_equal(before[2][:, 0, t], after[2][:, 0, t]):
+            critic.add(what)
+    assert (actor, critic) == tuple(set(words.split()) for words in SEEN[name])
+
+
+def test_acting_sees_no_state():
+    assert list(inspect.signature(SAC.act).parameters) == ["self", "params", "memory", "observation", "previous_action"]
+    assert "state" not in inspect.signature(SAC.explore).parameters
+
+
+@pytest.mark.parametrize(("name", "memory"), [("base", "gpt"), ("mi", "gru"), ("believer", "gpt")])
+def test_step_by_step_equals_the_full_pass(name: str, memory: Any):
+    case = Case(name, memory=memory)
+    tokens, agent = case.tokens, case.state.params["agent"]
+    mean, _, _, _ = case.says(agent, tokens, tokens.previous_action)
+    frames, act = np.asarray(tokens.frames).reshape(2, ROW, 2), jax.jit(case.sac.act)
+    for row, first, end in SPANS:
+        state = case.sac.initial_memory(1)
+        for t in range(first, end):
+            state, action = act(agent, state, jnp.asarray(frames[row, t][None]), tokens.previous_action[row, t][None])
+            np.testing.assert_allclose(action[0], np.tanh(mean[row, t]), atol=2e-5)
+
+
+def test_psi_starts_the_trunk_and_every_memoryless_branch():
+    env, rep = Shapes(), representation(Shapes())
+    for shared in (True, False):
+        config = dataclasses.replace(CONFIG, sac=dataclasses.replace(CONFIG.sac, shared_trunk=shared))
+        agent = jax.jit(make_agent(env, config).init)(jax.random.key(3), rep).params["agent"]
+        body = {name: part for name, part in rep.psi.items() if name != "output"}
+        for branch in ("actor", "critic"):
+            expected = rep.psi["output"] if shared else rep.psi
+            jax.tree.map(np.testing.assert_array_equal, agent[branch]["bottom"], expected)
+        assert ("trunk" in agent) == shared
+        if shared:
+            jax.tree.map(np.testing.assert_array_equal, agent["trunk"], body)
+
+
+def test_titles_follow_the_algorithm():
+    titles = [title_of(dataclasses.replace(CONFIG, agent=name), continuous=True) for name in VARIANTS]
+    assert titles == ["Ours", "TSAC", "ZP-RSAC", "BA-TSAC", "UA-TSAC", "B-SAC", "MDP"]
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"demonstrations": 3}, "--sac.demonstrations: got 3, accepted: 0, as shapes has no expert"),
+    ({"rotated_copies": 4}, "--sac.rotated-copies: got 4, accepted: 0, as shapes cannot show a moment again"),
+    ({"updates_per_step": 0.05}, "--sac.updates-per-step: got 0.05"),
+    ({"batch_episodes": 7}, "--sac.batch-episodes: got 7, accepted: an even number"),
+    ({"initial_temperature": 0.0}, "--sac.initial-temperature: got 0.0, accepted: a number > 0"),
+])
+def test_bad_options_are_refused_in_one_line(changes: dict[str, Any], message: str):
+    with pytest.raises(ConfigError, match=message):
+        make_agent(Shapes(), dataclasses.replace(CONFIG, sac=dataclasses.replace(CONFIG.sac, **changes)))
+
+
+# In the loop
+
+
+class Run:
+    """A learner on `Compass` with its functions compiled."""
+
+    def __init__(self, config: Config) -> None:
+        self.learner = make_learner(Compass(), config, pack=False)
+        self.representation = representation(Compass()) if needs_representation(config) else None
+        self.init, self.chunk = jax.jit(self.learner.init), jax.jit(self.learner.run_chunk)
+        self.evaluate = jax.jit(self.learner.evaluate, static_argnums=2)
+
+    def start(self, seed: int = 0) -> LearnerState:
+        return self.init(jax.random.key(seed), self.representation)
+
+
+LOOP = dataclasses.replace(
+    CONFIG, sac=dataclasses.replace(CONFIG.sac, demonstrations=5, rotated_copies=3), memory="gru")
+
+
+@pytest.fixture(scope="module")
+def ours() -> tuple[Run, LearnerState]:
+    """`mi` with demonstrations and copies, before learning."""
+    run = Run(LOOP)
+    return run, run.start()
+
+
+@pytest.mark.lenient
+def test_demonstrations_are_in_the_replay_from_the_start(ours: tuple[Run, LearnerState]):
+    state = jax.device_get(ours[1])
+    replay = state.replay
+    assert int(replay.count) >= 5
+    for slot in replay.finished[:5]:
+        assert replay.length[slot] == Compass.choice + 2
+        data = jax.tree.map(lambda x, slot=slot: x[slot], replay.data)
+        moments, actions = data.observation, data.previous_action
+        assert moments.rewarded.tolist() == [False] * 3 + [True, False]
+        np.testing.assert_allclose(actions[0], 0)
+        np.testing.assert_allclose(actions[1:4], 0.8 * np.asarray(moments.cue)[:3], rtol=1e-6)
+        assert data.reward[3] == 1
+        assert bool(data.terminated[3])
+
+
+@pytest.mark.lenient
+def test_a_sampled_copy_is_turned_as_a_whole(ours: tuple[Run, LearnerState]):
+    """Frames, actions, states and z_s of an episode turn by one angle; copy 0 not at all; angles differ otherwise."""
+    run, state = ours
+    learner, replay, slots = run.learner, state.replay, state.replay.finished[jnp.zeros((8,), jnp.int32)]
+    read = jax.jit(lambda key: learner._read(replay, slots, one_per_row(8), 8, key))
+    tokens = jax.device_get(read(jax.random.key(4)))
+    cue = np.asarray(replay.data.observation.cue)[int(slots[0]), 0]
+    length, angles = Compass.choice + 2, []
+    phi = networks_for(Compass(), FEATURES).phi
+    for row in range(8):
+        seen = np.asarray(tokens.frames).reshape(8, -1, 4)[row, 0, :2]
+        angle = np.arctan2(seen[1], seen[0]) - np.arctan2(cue[1], cue[0])
+        angles.append(np.round(angle % (2 * np.pi), 3))
+        np.testing.assert_allclose(tokens.previous_action[row, 1:length], np.tile(0.8 * seen, (3, 1)), atol=1e-5)
+        turned = jnp.array([[*seen, t] for t in range(length)], jnp.float32)
+        labels: Any = phi.apply({"params": state.representation.phi}, turned)  # pyright: ignore[reportOptionalMemberAccess]
+        np.testing.assert_allclose(tokens.z_s[row, :length], labels, atol=1e-4)
+    assert 0.0 in [x % 6.283 for x in angles]
+    assert 2 < len(set(angles)) <= 4
+
+
+@pytest.mark.lenient
+@pytest.mark.parametrize("agent", ["ua", "believer", "mdp"])
+def test_every_agent_runs_in_the_loop(agent: str):
+    run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", stage1=Stage1Config(features=FEATURES, episodes=4)))
+    state, metrics = run.chunk(run.start())
+    assert int(state.agent.updates) == 12
+    assert all(np.isfinite(x) for name, x in jax.device_get(metrics).items() if name.startswith(("loss/", "actor/")))
+    results = jax.device_get(run.evaluate(state, jax.random.key(0), 3))
+    assert (results["length"] == Compass.choice + 1).all()
+
+
+@pytest.mark.lenient
+def test_a_seed_is_the_same_alone_and_beside_others_and_goes_on_where_it_stopped(ours: tuple[Run, LearnerState]):
+    run, start = ours
+    half = jax.jit(run.learner.run_chunk, static_argnums=1)
+    once, _ = half(start, 2)
+    twice, _ = half(half(start, 1)[0], 1)
+
+    def numbers(state: LearnerState) -> list[Any]:
+        return jax.tree.leaves((state.agent, state.replay))
+
+    for x, y in zip(numbers(once), numbers(twice), strict=True):
+        np.testing.assert_array_equal(x, y)
+    init, keys = run.learner.agent.init, jax.random.key(9)
+    both = jax.jit(jax.vmap(lambda seed: init(jax.random.key(seed), run.representation)))(jnp.arange(2))
+    update = lambda agent: run.learner.update(agent, start.replay, run.representation, keys)[0].params  # noqa: E731
+    together = jax.jit(jax.vmap(update))(both)
+    alone = jax.jit(update)(jax.tree.map(lambda x: x[1], both))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x[1], y, atol=2e-5), together, alone)
+
+
+LEARNING = dataclasses.replace(
+    CONFIG, num_envs=8, steps_per_iteration=4, steps=6400,
+    network=NetworkConfig(action_embedding=8, observation_embedding=8, gru_width=16, critic_hidden=(32,),
+                          actor_hidden=(32,), auxiliary_hidden=(32,), dropout=0.0),
+    sac=SACConfig(batch_episodes=16, updates_per_step=0.25, learning_rate=3e-3, target_rate=0.02, replay_steps=20_000,
+                  warmup_episodes=10, demonstrations=40, rotated_copies=4),
+    information=InformationConfig(intrinsic_weight=0.1), evaluation=EvaluationConfig(every=6400))
+
+
+@pytest.mark.lenient
+@pytest.mark.parametrize(("agent", "memory"), [
+    ("base", "gru"), pytest.param("base", "gpt", marks=pytest.mark.slow),
+    pytest.param("mi", "gpt", marks=pytest.mark.slow)])
+def test_a_memory_task_is_solved(agent: str, memory: Any):
+    run = Run(dataclasses.replace(LEARNING, agent=agent, memory=memory))
+    state, _ = run.chunk(run.start())
+    results = jax.device_get(run.evaluate(state, jax.random.key(1), 200))
+    assert results["success"].mean() >= 0.9

@@ -63,11 +63,13 @@ class Sizes:
     """Seeds that are trained together."""
     chunk_steps: int = 1000
     """Environment steps of each seed that are timed together."""
+    robot_steps: int = 200
+    """Steps of each robot environment per measurement."""
 
 
 FULL_LENGTH, TRAINED = "full length", "trained agent's replay"
 QUICK = Sizes(matrix=64, repetitions=1, batches=(1, 8), environment_steps=64, max_scan=8, stage1_episodes=30, updates=1,
-              replay_episodes=8, batch_episodes=4, seeds=2, chunk_steps=20)
+              replay_episodes=8, batch_episodes=4, seeds=2, chunk_steps=20, robot_steps=2)
 """Tries every measurement in seconds; its numbers mean nothing."""
 
 
@@ -156,6 +158,27 @@ def bench_environments(bench: Bench, env: Environment) -> Iterator[Result]:
                             detail="consumed: the largest of observation, state, reward and ends")
 
 
+def bench_robot(bench: Bench, env: Environment) -> Iterator[Result]:
+    """A robot task whole, on all cores; MuJoCo C of the same model; the replay's memory, as images and as moments."""
+    from launch import robots  # it needs MuJoCo
+
+    first, second = robots.measure_apart(env.name, bench.sizes.robot_steps, bench.sizes.repetitions)
+    batch = robots.BATCH * second.devices
+
+    def result(what: str, per_second: float, unit: str, units: int, compile_seconds: float, detail: str) -> Result:
+        return Result(env.name, what, per_second, unit, 1e3 * units / per_second, compile_seconds, None, None,
+                      peak_memory_mib(), detail)
+
+    yield result(f"environment, batch {batch}", max(first.steps_per_second, second.steps_per_second), "steps", batch,
+                 first.compile_seconds, f"{second.devices} devices, 84 x 84 observation and state; a second process "
+                 f"compiles in {second.compile_seconds:.1f} s")
+    yield result("MuJoCo C, physics alone", max(first.c_steps_per_second, second.c_steps_per_second), "steps", 1, 0.0,
+                 "the same model, one core")
+    yield result("moments shown", max(first.frames_per_second, second.frames_per_second), "moments", 1, 0.0,
+                 f"{robots.TRANSITIONS:,} transitions take {second.moment_mib:.0f} MiB as moments, "
+                 f"{second.image_mib:.0f} as images")
+
+
 def bench_acting(bench: Bench, env: Environment) -> Iterator[Result]:
     """The policy alone: a token in, an action out, with the memory carried along."""
     learner, agent, _ = fresh_learner(env, configs.preset(env.name), bench.sizes)
@@ -178,7 +201,7 @@ def bench_stage1(bench: Bench, env: Environment) -> Iterator[Result]:
     config = configs.preset(env.name).stage1
     if bench.sizes.stage1_episodes:
         config = dataclasses.replace(config, episodes=bench.sizes.stage1_episodes, batch_size=100)
-    data = collect(env, jax.random.key(0), config.episodes)
+    data = collect(env, jax.random.key(0), config.episodes, config.data)
     problem = Problem.of(env, config, data)
     state, updates = initial_state(problem, jax.random.key(1)), problem.updates_per_epoch
     epoch = functools.partial(make_epoch(problem), LossWeights.of(config))
@@ -340,6 +363,8 @@ def show(results: Sequence[Result], console: Console) -> None:
     console.print(table)
 
 
+ROBOT_PARTS = ("environments", "stage1")
+"""What there is to measure on a robot task."""
 PARTS: dict[str, Callable[[Bench, Environment], Iterator[Result]]] = {
     "environments": bench_environments, "acting": bench_acting, "stage1": bench_stage1, "stage2": bench_stage2,
     "agents": bench_agents, "seeds": bench_seeds}
@@ -350,7 +375,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m launch.bench", description="How fast everything is here.")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     parser.add_argument("--only", nargs="+", choices=tuple(PARTS), default=tuple(PARTS), help="parts to measure")
-    parser.add_argument("--domains", nargs="+", choices=configs.DOMAINS, default=configs.DOMAINS)
+    parser.add_argument("--domains", nargs="+", choices=(*configs.DOMAINS, *configs.ROBOTS),
+                        default=configs.DOMAINS, help="the robots only where named")
     parser.add_argument("--quick", action="store_true", help="tiny sizes; the numbers mean nothing")
     return parser.parse_args(arguments)
 
@@ -364,8 +390,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bench = Bench(QUICK if options.quick else Sizes())
     results = [bench.matmul()]
     for domain in options.domains:
-        for part in (part for part in PARTS if part in options.only):
-            results.extend(PARTS[part](bench, registry.make(domain)))
+        robot = domain in configs.ROBOTS
+        for part in (part for part in (ROBOT_PARTS if robot else PARTS) if part in options.only):
+            function = bench_robot if robot and part == "environments" else PARTS[part]
+            results.extend(function(bench, registry.make(domain)))
     if options.json:
         print(json.dumps({"matmul_gflops": bench.matmul_gflops, "results": [vars(r) for r in results]}, indent=2))
     else:

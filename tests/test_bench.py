@@ -45,3 +45,13 @@ def test_quick_bench_reports_every_part_as_json(domain, capsys, monkeypatch):
     for result in report["results"][3:-2]:
         assert result["gflop"] > 0
         assert result["matmul_fraction"] > 0
+
+
+@pytest.mark.slow  # two processes compile the environment
+@pytest.mark.lenient
+def test_quick_bench_of_a_robot(capsys):
+    assert bench.main(["--json", "--quick", "--only", "environments", "--domains", "block_pulling"]) == 0
+    _, environment, physics, moments = json.loads(capsys.readouterr().out)["results"]
+    assert environment["what"].startswith("environment, batch ")
+    assert min(result["per_second"] for result in (environment, physics, moments)) > 0
+    assert "second process" in environment["detail"]

@@ -56,7 +56,12 @@ class Plane(Environment):
         def play(key):
             actions = jax.random.uniform(key, (self.horizon, 2), jnp.float32, -1.0, 1.0)
             first = self.reset(key)[0]
-            later = jax.lax.scan(lambda s, a: (self.step(key, s, a)[0],) * 2, first, actions)[1]
+
+            def step(env_state, action):
+                env_state = self.step(key, env_state, action)[0]
+                return env_state, env_state
+
+            later = jax.lax.scan(step, first, actions)[1]
             return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), first, later), actions
 
         moments, actions = jax.vmap(play)(jax.random.split(key, number))
@@ -72,7 +77,8 @@ class Clumsy(Plane):
     """Its expert fails now and then."""
 
     def demonstrations(self, key, number):
-        return super().demonstrations(key, number).replace(success=jnp.arange(number) > 0)
+        shown = super().demonstrations(key, number)
+        return Demonstrations(shown.env_state, shown.action, shown.length, jnp.arange(number) > 0)
 
 
 @pytest.fixture(scope="module")

@@ -251,6 +251,9 @@ def _check_values(
         value = np.asarray(getattr(timestep, field))
         if np.issubdtype(value.dtype, np.floating):
             _require(env, bool(np.isfinite(value).all()), f"{field} of {place}", "not finite", "finite numbers")
+    for field, spec in (("observation", env.observation_spec), ("state", env.state_spec)):
+        empty = np.asarray(getattr(timestep, field))[..., spec.shape[-1] - spec.blank :] if spec.blank else np.zeros(1)
+        _require(env, not empty.any(), f"the blank channels of {field} of {place}", "not 0", "0, as the spec declares")
     if listed is not None:
         seen = np.asarray(timestep.observation)
         found = (listed == seen).reshape(len(listed), -1).all(axis=1).any()

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import configs
-from mijax.agents.variants import stage1_of
+from mijax.agents.variants import VARIANTS, stage1_of
 from mijax.config import Config
 from mijax.figures import display_name
 from mijax.results import AGENT_COLOURS
@@ -44,8 +44,10 @@ AGENTS = (
 
 
 def agents(domain: str) -> dict[str, tuple[Arm, ...]]:
-    """Fig. 3: every agent."""
-    return {display_name(domain): AGENTS}
+    """Fig. 3: every agent, under its name on the domain's algorithm."""
+    if domain not in configs.ROBOTS:
+        return {display_name(domain): AGENTS}
+    return {display_name(domain): tuple(dataclasses.replace(arm, label=VARIANTS[arm.name].title_sac) for arm in AGENTS)}
 
 
 def overlap(domain: str, sources: Sequence[str] = ("ours", "believer")) -> dict[str, tuple[Arm, ...]]:

@@ -255,8 +255,7 @@ SEEN = {  # agent: what the actor's choice at the last token of an episode depen
 }
 
 
-@pytest.mark.parametrize("shared_trunk", [True, False])
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize(("name", "shared_trunk"), [*((name, True) for name in VARIANTS), ("mi", False), ("ua", False)])
 def test_what_each_network_sees(name: str, shared_trunk: bool):
     case = Case(name, sac=dataclasses.replace(CONFIG.sac, shared_trunk=shared_trunk))
     t, zero = 3, jnp.zeros((2, ROW, ACTIONS))  # the last token of the first episode of row 0
@@ -394,7 +393,8 @@ def test_a_sampled_copy_is_turned_as_a_whole(ours: tuple[Run, LearnerState]):
 
 
 @pytest.mark.lenient
-@pytest.mark.parametrize("agent", ["ua", "believer", "mdp"])
+@pytest.mark.parametrize("agent", [
+    "ua", pytest.param("believer", marks=pytest.mark.slow), pytest.param("mdp", marks=pytest.mark.slow)])
 def test_every_agent_runs_in_the_loop(agent: str):
     run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", stage1=Stage1Config(features=FEATURES, episodes=4)))
     state, metrics = run.chunk(run.start())
@@ -404,6 +404,7 @@ def test_every_agent_runs_in_the_loop(agent: str):
     assert (results["length"] == Compass.choice + 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.lenient
 def test_a_seed_is_the_same_alone_and_beside_others_and_goes_on_where_it_stopped(ours: tuple[Run, LearnerState]):
     run, start = ours

@@ -214,4 +214,4 @@ class PrivilegedActorCritic(ActorCritic):
     ) -> tuple[MemoryState, jax.Array, jax.Array]:
         """As the base class says."""
         del previous_action
-        return MemoryState(state.position + 1, ()), *self.policy(self.features.see(observation))
+        return MemoryState(state.position + 1, ()), *self.policy(self.features.see(self.look_at(observation)))

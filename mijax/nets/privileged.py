@@ -25,7 +25,8 @@ class StateShown(Environment):
         self._env = env
         self.name, self.horizon, self.action_spec = env.name, env.horizon, env.action_spec
         self.state_spec, self.variables = state, env.variables
-        self.observation_spec = ArraySpec((*state.shape[:-1], state.shape[-1] + observation.shape[-1]), state.dtype)
+        self.observation_spec = ArraySpec(
+            (*state.shape[:-1], state.shape[-1] + observation.shape[-1]), state.dtype, observation.blank)
 
     def reset(self, key: jax.Array) -> tuple[EnvState, TimeStep]:
         """As the environment does."""

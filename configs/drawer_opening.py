@@ -20,6 +20,7 @@ from mijax.config import (
 CONFIG = Config(
     domain="drawer_opening",
     steps=40_000,
+    num_envs=2,
     stage1=Stage1Config(episodes=80, learning_rate=1e-3, lambda_r=100.0, lambda_s=1.0, lambda_o=1.0, lambda_club=1.0,
                         lambda_dim_s=0.001, lambda_dim_o=1.0),
     network=NetworkConfig(action_embedding=16, observation_embedding=64, dropout=0.0),

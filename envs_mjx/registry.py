@@ -8,6 +8,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -162,7 +163,7 @@ _PAIRS = {"reset": (TimeStep, "(env_state, TimeStep)"), "step": (TimeStep, "(env
 """Methods that return an `EnvState` and something else: what it is, in eyes of `jax.eval_shape` and of people."""
 
 
-def _evaluate(env: Environment, place: str, function: Callable, *args: object):
+def _evaluate(env: Environment, place: str, function: Callable, *args: object) -> Any:
     """Shapes and types of what `function` returns."""
     try:
         result = jax.eval_shape(function, *args)

@@ -20,6 +20,7 @@ from mijax.config import (
 CONFIG = Config(
     domain="block_pushing",
     steps=40_000,
+    num_envs=2,
     stage1=Stage1Config(data="demonstrations", episodes=80, heldout_episodes=80, copies=12, epochs=3, batch_size=100,
                         learning_rate=2e-3, lambda_r=10.0, lambda_s=0.1, lambda_o=1.0, lambda_club=0.01,
                         lambda_dim_s=0.0, lambda_dim_o=1.0),

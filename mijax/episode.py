@@ -80,7 +80,7 @@ def _trace(learner: Learner, state: LearnerState, key: jax.Array, num: int) -> d
         later, arrived = jax.vmap(env.step)(jax.random.split(key, num), env_state, action)
         return (later, arrived, memory, action), (env_state, timestep, previous, action)
 
-    carry = env_state, first, agent.initial_memory(num), jnp.full((num,), -1, jnp.int32)
+    carry = env_state, first, agent.initial_memory(num), agent.no_action(num)
     (last_state, last, _, last_action), steps = jax.lax.scan(step, carry, jax.random.split(key_steps, env.horizon))
     ending = last_state, last, last_action, last_action
     whole = jax.tree.map(lambda a, b: jnp.moveaxis(jnp.concatenate([a, b[None]]), 0, 1), steps, ending)

@@ -102,7 +102,7 @@ def play(learner: Learner, state: LearnerState, key: jax.Array) -> list[EnvState
             env_state, timestep = env.step(key, env_state, action[0])
             return (env_state, timestep.observation, memory, action), (env_state, timestep.done)
 
-        carry = first, timestep.observation, agent.initial_memory(1), jax.numpy.full((1,), -1, jax.numpy.int32)
+        carry = first, timestep.observation, agent.initial_memory(1), agent.no_action(1)
         _, (later, done) = jax.lax.scan(step, carry, jax.random.split(key_steps, env.horizon))
         return first, later, done
 

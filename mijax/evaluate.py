@@ -135,9 +135,13 @@ def show(env: Environment, states: Sequence[EnvState], title: str, gif: pathlib.
     """One episode in the terminal, and as a file."""
     if text:
         print(f"{title}\n\n" + "\n\n".join(draw.text(env, env_state) for env_state in states) + "\n")
-    if gif is not None:
+    if gif is None:
+        return
+    if evaluate_robot.is_robot(env):
+        evaluate_robot.save_gif(env, states, gif, print)
+    else:
         draw.save_gif(gif, [draw.frame(env, env_state) for env_state in states])
-        print(f"{title}: {gif}")
+    print(f"{title}: {gif}")
 
 
 def check(options: EvaluateOptions) -> None:

@@ -22,11 +22,16 @@ EPISODE_FILE, PAGE_FILE = "planner.gif", "planner.html"
 DEMONSTRATED = ", ".join(configs.ROBOTS)
 
 
+def is_robot(env: Environment) -> bool:
+    """Whether an environment is a robot task; MuJoCo is imported with the task only."""
+    return hasattr(env, "physics")
+
+
 def robot(option: str, domain: str) -> Environment:
     """The robot task of that name; `ConfigError` for a domain without a planner, before any work."""
     env = registry.make(domain)
     has_expert = type(env).demonstrations is not Environment.demonstrations
-    require(has_expert and hasattr(env, "physics"), "domain", domain, f"with --{option} a robot task: {DEMONSTRATED}")
+    require(has_expert and is_robot(env), "domain", domain, f"with --{option} a robot task: {DEMONSTRATED}")
     return env
 
 
@@ -69,7 +74,8 @@ def evaluate_planner(
         (out / PAGE_FILE).write_text(page.page(env, moments, scripts))  # pyright: ignore[reportArgumentType]
         say(f"an episode that begins with the immovable object: {out / PAGE_FILE}")
     if gif:
-        _save_gif(env, moments, out, say)
+        save_gif(env, moments, out / EPISODE_FILE, say)
+        say(f"an episode that begins with the immovable object: {out / EPISODE_FILE}")
     return played
 
 
@@ -91,11 +97,11 @@ def _endings(played: "Trial") -> str:
     return "endings: " + ", ".join(f"{name} {count}" for name, count in played.counts().items())
 
 
-def _save_gif(env: Environment, moments: Sequence[EnvState], out: pathlib.Path, say: Callable[[str], None]) -> None:
+def save_gif(env: Environment, moments: Sequence[EnvState], path: pathlib.Path, say: Callable[[str], None]) -> None:
+    """An episode of a robot task as a film: depth, what the state adds, and a rendered view where there is OpenGL."""
     from envs_mjx.robot import film
 
     pictures = film.rendered(env, moments)  # pyright: ignore[reportArgumentType]
     if pictures is None:
         say("no OpenGL without a display (EGL or OSMesa): the pictures show depth and state, and no rendered view")
-    draw.save_gif(out / EPISODE_FILE, film.frames(env, moments, pictures))  # pyright: ignore[reportArgumentType]
-    say(f"an episode that begins with the immovable object: {out / EPISODE_FILE}")
+    draw.save_gif(path, film.frames(env, moments, pictures))  # pyright: ignore[reportArgumentType]

@@ -59,8 +59,8 @@ def report_episode(options: "ReportOptions") -> pathlib.Path:
         raise RunError(f"--seed: got {seed}, accepted: {', '.join(map(str, seeds)) or 'none, the run has no seed yet'}")
     learner = make_learner(registry.make(config.domain), config)
     if not isinstance(learner.env.action_spec, DiscreteActions):
-        raise RunError(f"--episode: {config.domain} has continuous actions, accepted: a run with discrete ones (a film: "
-                       f"python -m mijax.evaluate {run.path} --gif)")
+        raise RunError(f"--episode: {config.domain} has continuous actions, accepted: a run with discrete ones; for a "
+                       f"film: python -m mijax.evaluate {run.path} --gif")
     step, state = evaluate.load_learner_state(run, seed, learner)
     seen = episode.trace(learner, state, evaluation_key(seed, step), 1)
     path = (options.out or run.path) / f"episode_seed_{seed}.png"

@@ -48,7 +48,8 @@ class Signpost(Environment):
         del key
         turns = (env_state.place == END) & (action >= 2)
         reward = jnp.where(action - 2 == env_state.side, 1.0, -1.0)
-        place = jnp.clip(env_state.place + (action == 1) - (action == 0), 0, END).astype(jnp.int32)
+        move = jnp.array([-1, 1, 0, 0], jnp.int32)[action]
+        place = jnp.clip(env_state.place + move, 0, END)
         after = SignpostState(place, env_state.side, env_state.time + 1)
         return after, self._show(after, jnp.where(turns, reward, 0.0), turns)
 
@@ -61,8 +62,8 @@ class Signpost(Environment):
         return env_state.place == 0
 
     def _show(self, env_state: SignpostState, reward: jax.Array, terminated: jax.Array) -> TimeStep:
-        place = env_state.place / END
-        side = 2.0 * env_state.side - 1.0
+        place = env_state.place.astype(jnp.float32) / END
+        side = jnp.where(env_state.side == 1, 1.0, -1.0)
         return TimeStep(
             observation=jnp.stack([place, jnp.where(self.reveals(env_state), side, 0.0)]),
             state=jnp.stack([place, side]),

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import AxisType, PartitionSpec
 from rich.console import Console
 from rich.table import Table
 
@@ -140,9 +141,11 @@ def bench_environments(bench: Bench, env: Environment) -> Iterator[Result]:
     """
     for batch in bench.sizes.batches:
         steps = max(1, min(bench.sizes.max_scan, bench.sizes.environment_steps // batch))
+        devices = len(jax.local_devices())
+        devices = devices if batch % (64 * devices) == 0 else 1
 
-        def run(key: jax.Array, batch: int = batch, steps: int = steps) -> jax.Array:
-            start = jax.vmap(env.reset)(jax.random.split(key, batch))
+        def run(keys: jax.Array, batch: int = batch // devices, steps: int = steps) -> jax.Array:
+            start = jax.vmap(env.reset)(jax.random.split(keys[0], batch))
 
             def step(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
                 key_action, key_step, key_reset = jax.random.split(key, 3)
@@ -152,10 +155,15 @@ def bench_environments(bench: Bench, env: Environment) -> Iterator[Result]:
                 shown = jnp.stack([jnp.max(x).astype(jnp.float32) for x in jax.tree.leaves(timestep)])
                 return select(timestep.done, fresh, (env_state, timestep)), shown
 
-            return jnp.sum(jax.lax.scan(step, start, jax.random.split(key, steps))[1])
+            return jnp.sum(jax.lax.scan(step, start, jax.random.split(keys[0], steps))[1])[None]
 
-        yield bench.measure(env.name, f"environment, batch {batch}", "steps", steps, batch, run, jax.random.key(0),
-                            detail="consumed: the largest of observation, state, reward and ends")
+        mesh = jax.make_mesh((devices,), ("environments",), axis_types=(AxisType.Auto,))
+        spread = jax.shard_map(run, mesh=mesh, in_specs=PartitionSpec("environments"),
+                               out_specs=PartitionSpec("environments"), check_vma=False)
+        yield bench.measure(
+            env.name, f"environment, batch {batch}", "steps", steps, batch, spread,
+            jax.random.split(jax.random.key(0), devices),
+            detail=f"{devices} device{'s' * (devices > 1)}; consumed: the largest of all that a step shows")
 
 
 def bench_robot(bench: Bench, env: Environment) -> Iterator[Result]:
@@ -384,7 +392,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
-    runtime.prepare(host_devices=runtime.cores() if "seeds" in options.only else 1)
+    runtime.prepare(host_devices=runtime.cores() if {"environments", "seeds"} & set(options.only) else 1)
     if not options.quick:
         jax.config.update("jax_enable_compilation_cache", False)
     bench = Bench(QUICK if options.quick else Sizes())

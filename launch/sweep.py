@@ -50,6 +50,8 @@ KEYS = ("options", "grid", "seeds", "seeds_per_job", "resources", "retries")
 RESOURCES = ("cpus", "gpus")
 SET_BY_SWEEP = ("seeds", "out", "resume")
 REFRESH_SECONDS = 2.0
+STOP = signal.SIGTERM
+"""Asks a run to save and end. Ctrl-C's signal would be ignored by what a shell has started in the background."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,11 +199,11 @@ def run_job(
         try:
             code = process.wait()
         except KeyboardInterrupt:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(STOP)
             code = process.wait()
         if job.done:
             return "done"
-        if code in (0, -signal.SIGINT):
+        if code in (0, -STOP):
             return "stopped"
         if code > 0:
             return "failed"
@@ -271,7 +273,7 @@ class Local:
         self._todo.clear()
         for process in self._processes:
             if process.poll() is None:
-                process.send_signal(signal.SIGINT)
+                process.send_signal(STOP)
         for thread in self._threads:
             thread.join()
 

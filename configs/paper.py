@@ -2,11 +2,11 @@
 
 import dataclasses
 
+from configs import ROBOTS
 from mijax.config import Config
 
 CRITIC_LEARNING_RATE = {"sphinx": 3e-5, "carflag_2d": 3e-5}
 """Table 2: 3e-5 on Sphinx and CarFlag-2D, 3e-4 elsewhere."""
-ROBOTS = ("block_pulling", "block_pushing", "drawer_opening")
 INTRINSIC_WEIGHT = {"heaven_hell": 10.0, "sphinx": 10.0, "carflag_2d": 0.0} | dict.fromkeys(ROBOTS, 0.1)
 """Table 2, for the bonus in its cosine form."""
 STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000} | dict.fromkeys(ROBOTS, 40_000)

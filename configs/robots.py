@@ -1,0 +1,40 @@
+"""What the presets of the three robot tasks share (paper Appendix B.4, Tables 2 and 3).
+
+The budget is the paper's: 800 episodes of 50 steps, one update for each step, 80 demonstrations of the scripted expert
+in the replay from the start, every episode sampled as it was or in one of four turned copies. Dropout is off, so that one
+pass serves gradients and targets. Stage 1 sees copies of each demonstrated transition as Table 3 has them, for a budget
+of minutes (results/robots).
+"""
+
+from mijax.config import (
+    Config,
+    EvaluationConfig,
+    InformationConfig,
+    NetworkConfig,
+    SACConfig,
+    SelfPredictionConfig,
+    Stage1Config,
+)
+
+
+def robot(domain: str, copies: int, epochs: int) -> Config:
+    """The preset of a robot task.
+
+    Args:
+        domain: its name.
+        copies: of every demonstrated transition in stage 1 (Table 3).
+        epochs: of stage 1.
+    """
+    return Config(
+        domain=domain,
+        steps=40_000,
+        num_envs=2,
+        stage1=Stage1Config(data="demonstrations", episodes=80, heldout_episodes=80, copies=copies, epochs=epochs,
+                            batch_size=100, learning_rate=2e-3, lambda_r=10.0, lambda_s=0.1, lambda_o=1.0,
+                            lambda_club=0.01, lambda_dim_s=0.0, lambda_dim_o=1.0),
+        network=NetworkConfig(action_embedding=16, observation_embedding=64, dropout=0.0),
+        sac=SACConfig(demonstrations=80, rotated_copies=4),
+        zp=SelfPredictionConfig(weight=0.1),
+        information=InformationConfig(auxiliary_weight=0.5, intrinsic_weight=0.1, intrinsic_form="cosine"),
+        evaluation=EvaluationConfig(every=500, episodes=10),
+    )

@@ -1,9 +1,9 @@
 """What the presets of the three robot tasks share (paper Appendix B.4, Tables 2 and 3).
 
 The budget is the paper's: 800 episodes of 50 steps, one update for each step, 80 demonstrations of the scripted expert
-in the replay from the start, every episode sampled as it was or in one of four turned copies. Dropout is off, so that one
-pass serves gradients and targets. Stage 1 sees copies of each demonstrated transition as Table 3 has them, for a budget
-of minutes (results/robots).
+in the replay from the start, every episode sampled as it was or in one of four turned copies. Dropout is off, so that
+one pass serves gradients and targets. Stage 1 sees copies of each demonstrated transition as Table 3 has them, for a
+budget of minutes (results/robots).
 """
 
 from mijax.config import (

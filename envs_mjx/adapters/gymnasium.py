@@ -15,8 +15,8 @@ class AsGymnasium(gymnasium.Env):
     """One environment, stepped from the host; its compiled functions are shared by all instances of a domain.
 
     `info` holds the privileged `state`, and `success` once an episode has ended. The time limit is reported as
-    `truncated`, so no wrapper is needed. For speed step our environments inside `jax.vmap`: a step from the host costs
-    a hundred times as much.
+    `truncated`, so no wrapper is needed. For speed step our environments inside `jax.vmap` instead: here every step
+    is a call from the host.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own convention)

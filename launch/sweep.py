@@ -283,8 +283,8 @@ class OnRay:
 
     def __init__(self, sweep: Sweep, address: str | None = None) -> None:
         try:
-            import ray
-            import ray.exceptions
+            import ray  # pyright: ignore[reportMissingImports]
+            import ray.exceptions  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise ConfigError("--backend: got 'ray', which is not installed (pip install 'mijax[sweep]'), accepted: "
                               "local") from None

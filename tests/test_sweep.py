@@ -166,7 +166,7 @@ def test_a_job_dies_with_the_process_that_started_it(tmp_path: pathlib.Path):
 def test_a_ray_cluster_loses_a_worker_and_a_node(tmp_path: pathlib.Path):
     """Every job is done in the end, and none was done twice."""
     ray = pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
+    from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})

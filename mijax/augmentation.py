@@ -40,6 +40,30 @@ def show_copy(
     return env.show(env_state), action
 
 
+def draw_copies(tokens: Tokens, copies: int, batch: int, key: jax.Array) -> jax.Array:
+    """(R, L) int32: which copy of its episode each token shows, the same in all of an episode's, drawn uniformly."""
+    drawn = jax.random.randint(key, (batch,), 0, copies + 1, jnp.int32)
+    return drawn[jnp.maximum(tokens.segment - 1, 0)]
+
+
+def take_copies(tokens: Tokens, copies: int, batch: int, key: jax.Array) -> Tokens:
+    """Tokens of `batch` episodes, each in one of its copies, of a replay that stores what every copy shows.
+
+    Args:
+        tokens: their frames are features (R L, 1 + copies, D), their actions and z_s (R, L, 1 + copies, ...).
+        copies: besides the original.
+    """
+    copy = draw_copies(tokens, copies, batch, key)
+    frames = _take(jnp.asarray(tokens.frames), copy.reshape(-1))
+    z_s = None if tokens.z_s is None else _take(tokens.z_s, copy)
+    return dataclasses.replace(tokens, frames=frames, previous_action=_take(tokens.previous_action, copy), z_s=z_s)
+
+
+def _take(x: jax.Array, copy: jax.Array) -> jax.Array:
+    """(*B, 1 + copies, D) -> (*B, D) in the copies (*B,)."""
+    return jnp.take_along_axis(x, copy[..., None, None], axis=-2)[..., 0, :]
+
+
 def show_tokens(env: Environment, tokens: Tokens, copies: int, batch: int, key: jax.Array, states: bool) -> Tokens:
     """Tokens of `batch` episodes with frames in place of moments; each episode in one of its copies, drawn uniformly.
 
@@ -52,14 +76,13 @@ def show_tokens(env: Environment, tokens: Tokens, copies: int, batch: int, key: 
     if copies == 0:
         timestep, action, z_s = jax.vmap(env.show)(tokens.frames), flat, tokens.z_s
     else:
-        drawn = jax.random.randint(key, (batch,), 0, copies + 1, jnp.int32)
-        copy = drawn[jnp.maximum(tokens.segment - 1, 0)]
+        copy = draw_copies(tokens, copies, batch, key)
         symmetry = cast(jax.Array, tokens.symmetry).reshape(-1, 2)
         timestep, action = jax.vmap(lambda *moment: show_copy(env, *moment))(
             symmetry, copy.reshape(-1), tokens.frames, flat)
         z_s = tokens.z_s
         if z_s is not None:
-            z_s = jnp.take_along_axis(z_s, copy[..., None, None], axis=2)[:, :, 0]
+            z_s = _take(z_s, copy)
     return dataclasses.replace(
         tokens, frames=timestep.observation, previous_action=action.reshape(tokens.previous_action.shape), z_s=z_s,
         states=timestep.state if states else None, symmetry=None)

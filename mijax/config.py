@@ -67,6 +67,9 @@ class Stage1Config:
     """Weight of the loss of the next observation feature."""
     lambda_club: float = 1.0
     """Weight of the upper bound of I(z_s; z_o), which is minimised."""
+    club_ramp: float = 0.0
+    """Fraction of training over which lambda_club grows, geometrically from a hundredth of itself; 0 is the paper's
+    constant. At its full weight from the start, CLUB on camera images stops all learning before it has begun."""
     lambda_dim_s: float = 0.0
     """Weight of the lower bound of I(s; z_s), which is maximised."""
     lambda_dim_o: float = 1.0
@@ -91,6 +94,7 @@ class Stage1Config:
         require(self.copies == 0 or self.data == "demonstrations", "stage1.copies", self.copies,
                 "0, unless --stage1.data is demonstrations")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
+        require(0 <= self.club_ramp <= 1, "stage1.club-ramp", self.club_ramp, "a number in [0, 1]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,6 +217,9 @@ class SACConfig:
     shared_trunk: bool = True
     """Whether frames are encoded once per update, for the actor, the critics, their targets and f, with a last layer of
     its own for each branch. Otherwise each branch has a whole encoder (the paper)."""
+    frozen_trunk: bool = False
+    """Whether a shared trunk that starts from psi stays as it is. The replay then stores its features, in every copy of
+    an episode, and no update looks at a frame. Agents that do not start from psi train theirs all the same."""
     critic_norm: bool = True
     """Whether the critics' hidden layers are normalised, which keeps values of unseen actions in bounds (paper: no)."""
     bootstrap_at_time_limit: bool = False

@@ -19,7 +19,7 @@ from envs_mjx.base import DiscreteActions, Environment, EnvState, TimeStep
 from mijax.agents.core import Agent, AgentState
 from mijax.agents.factory import make_agent
 from mijax.agents.variants import variant
-from mijax.augmentation import show_copy, show_tokens, shows_again
+from mijax.augmentation import show_copy, show_tokens, shows_again, take_copies
 from mijax.config import Config
 from mijax.frames import FrameTable
 from mijax.nets.encoders import encoder_for
@@ -186,12 +186,14 @@ class Learner:
         action_type = _integer_for(spec.num) if isinstance(spec, DiscreteActions) else jnp.float32
         table, declaration = self.observations, self.agent.declaration
 
-        def label(timestep: TimeStep, action: jax.Array, env_state: EnvState, symmetry: jax.Array | None) -> jax.Array:
-            if symmetry is not None:
-                moved = jax.vmap(jax.vmap(functools.partial(show_copy, self.env), (None, 0, None, None)),
-                                 (0, None, 0, 0))
-                timestep, _ = moved(symmetry, jnp.arange(copies + 1, dtype=jnp.int32), env_state, action)
-            return cast(jax.Array, phi.apply({"params": cast(Representation, representation).phi}, timestep.state))
+        def in_copies(
+            timestep: TimeStep, action: jax.Array, env_state: EnvState, symmetry: jax.Array | None
+        ) -> tuple[TimeStep, jax.Array]:
+            """What every copy shows, and the actions there: (E, 1 + copies, ...) each, where there are copies."""
+            if symmetry is None:
+                return timestep, action
+            moved = jax.vmap(jax.vmap(functools.partial(show_copy, self.env), (None, 0, None, None)), (0, None, 0, 0))
+            return moved(symmetry, jnp.arange(copies + 1, dtype=jnp.int32), env_state, action)
 
         def record(
             timestep: TimeStep, previous_action: jax.Array, env_state: EnvState = None,
@@ -199,7 +201,11 @@ class Learner:
         ) -> StepRecord:
             z_s, observation = None, env_state if self.moments else timestep.observation
             if representation is not None and not declaration.sees_state:
-                z_s = label(timestep, previous_action, env_state, symmetry)
+                shown, actions = in_copies(timestep, previous_action, env_state, symmetry)
+                z_s = cast(jax.Array, phi.apply({"params": representation.phi}, shown.state))
+                if self.agent.looks_once:
+                    observation = self.agent.see(representation, shown.observation).astype(jnp.float16)
+                    previous_action = actions
             if table is not None:
                 observation = table.index_of(timestep.observation).astype(_integer_for(len(table)))
             return StepRecord(
@@ -262,11 +268,11 @@ class Learner:
     def _read(self, replay: Replay, slots: jax.Array, layout: Layout, rows: int, key: jax.Array) -> Tokens:
         """(B,) episodes in so many rows, shown again where the replay stores moments."""
         tokens = gather_rows(replay, slots, layout, rows, self.observations)
-        if not self.moments:
-            return tokens
-        wants_state = self.agent.declaration.critic is not None
-        return show_tokens(
-            self.env, tokens, self.agent.copies, slots.shape[0], jax.random.fold_in(key, 1), wants_state)
+        copies, batch, key = self.agent.copies, slots.shape[0], jax.random.fold_in(key, 1)
+        if self.moments:
+            wants_state = self.agent.declaration.critic is not None
+            return show_tokens(self.env, tokens, copies, batch, key, wants_state)
+        return take_copies(tokens, copies, batch, key) if self.agent.looks_once and copies else tokens
 
 
 def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:
@@ -274,7 +280,9 @@ def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner
     domain, env = env, StateShown(env) if variant(config.agent).sees_state else env
     listed = env.all_observations()
     table = None if listed is None else FrameTable(listed)
-    return Learner(domain, env, config, make_agent(env, config), table, table is None and shows_again(env), pack)
+    agent = make_agent(env, config)
+    moments = table is None and not agent.looks_once and shows_again(env)
+    return Learner(domain, env, config, agent, table, moments, pack)
 
 
 def _integer_for(count: int) -> DTypeLike:

@@ -98,7 +98,7 @@ def gather_rows(
 
 
 def _actions(stored: jax.Array, used: jax.Array) -> jax.Array:
-    """(N,) int32 with -1 where not used, or (N, A) float32 with 0 there."""
+    """(N,) int32 with -1 where not used, or (N, A) float32, of each copy perhaps, with 0 there."""
     if jnp.issubdtype(stored.dtype, jnp.integer):
         return jnp.where(used, stored.astype(jnp.int32), -1)
-    return jnp.where(used[:, None], stored, 0)
+    return jnp.where(used.reshape(-1, *[1] * (stored.ndim - 1)), stored, 0)

@@ -17,9 +17,11 @@ from flax import struct
 class StepRecord:
     """What is stored of one step, for a token (a_{t-1}, o_t) and the transition that led to it."""
 
-    observation: Any  # (E, *observation_shape) in the environment's own dtype; (E,) which of all there are; or the
-    # moment, an EnvState with leaves (E, ...), of an environment that shows it again
-    previous_action: jax.Array  # (E,) integer, -1 on the first step of an episode; or (E, A) float32, there 0
+    observation: Any  # (E, *observation_shape) in the environment's own dtype; (E,) which of all there are; the
+    # moment, an EnvState with leaves (E, ...), of an environment that shows it again; or, of an agent that looks once,
+    # what it sees, (E, D) float16 or (E, 1 + copies, D) in each copy of the episode
+    previous_action: jax.Array  # (E,) integer, -1 on the first step of an episode; or (E, A) float32, there 0; beside
+    # features in each copy, it is (E, 1 + copies, A)
     reward: jax.Array  # (E,) float32, received on arriving
     terminated: jax.Array  # (E,) bool, on arriving
     truncated: jax.Array  # (E,) bool, on arriving

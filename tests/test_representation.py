@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from envs_mjx import registry
@@ -19,7 +20,7 @@ from mijax.representation.dataset import Transitions, collect, tabulate
 from mijax.representation.model import evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
 from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
-from mijax.representation.train import Problem, encode, shrink
+from mijax.representation.train import EstimatorState, Problem, club_growth, encode, shrink
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
 
@@ -105,6 +106,17 @@ def test_shrinking_stops_at_zero_and_spares_biases():
     updates: Any = transform.update(still, transform.init(weights), weights)[0]
     np.testing.assert_allclose(weights["kernel"] + updates["kernel"], [[0.9, 0.0, -0.2]], atol=1e-6)
     np.testing.assert_array_equal(updates["bias"], [0.0])
+
+
+@pytest.mark.lenient
+def test_clubs_weight_grows_to_its_full_value():
+    config = Stage1Config(club_ramp=0.5, estimator_updates=5)
+    optimizer = optax.adam(1e-3)
+    fit = EstimatorState({}, optimizer.init({}))
+    for done, expected in ((0, 0.01), (25, 0.1), (50, 1.0), (100, 1.0)):
+        counted = optax.tree.set(fit.optimizer, count=jnp.int32(done * config.estimator_updates))
+        growth = club_growth(config, dataclasses.replace(fit, optimizer=counted), 100)
+        np.testing.assert_allclose(growth, expected, rtol=1e-5)
 
 
 @pytest.mark.lenient

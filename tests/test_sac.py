@@ -393,6 +393,31 @@ def test_a_sampled_copy_is_turned_as_a_whole(ours: tuple[Run, LearnerState]):
 
 
 @pytest.mark.lenient
+def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
+    """The replay holds what psi's body says of each copy; updates get that, and leave the trunk alone."""
+    run, state = ours
+    frozen = Run(dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, frozen_trunk=True)))
+    start = frozen.start()
+    slots = state.replay.finished[jnp.zeros((8,), jnp.int32)]
+
+    def read(run: Run, state: LearnerState) -> Tokens:
+        return jax.jit(lambda key: run.learner._read(state.replay, slots, one_per_row(8), 8, key))(jax.random.key(4))
+
+    shown, seen = read(run, state), read(frozen, start)
+    real = np.asarray(shown.segment).reshape(-1) > 0
+    wanted = frozen.learner.agent.see(run.representation, jnp.asarray(shown.frames))  # pyright: ignore[reportArgumentType]
+    np.testing.assert_allclose(np.asarray(seen.frames)[real], np.asarray(wanted)[real], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(seen.previous_action, shown.previous_action, atol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(seen.z_s).reshape(len(real), -1)[real], np.asarray(shown.z_s).reshape(len(real), -1)[real],
+        atol=1e-5)
+    update = jax.jit(lambda state: frozen.learner.update(state.agent, state.replay, state.representation, state.key)[0])
+    before, now = start.agent.params["agent"], update(start).params["agent"]
+    jax.tree.map(np.testing.assert_array_equal, before["trunk"], now["trunk"])
+    assert (np.asarray(before["actor"]["bottom"]["kernel"]) != np.asarray(now["actor"]["bottom"]["kernel"])).any()
+
+
+@pytest.mark.lenient
 @pytest.mark.parametrize("agent", [
     "ua", pytest.param("believer", marks=pytest.mark.slow), pytest.param("mdp", marks=pytest.mark.slow)])
 def test_every_agent_runs_in_the_loop(agent: str):

@@ -79,6 +79,15 @@ class Agent(abc.ABC):
     def copies(self) -> int:
         """Copies of each episode, moved by a symmetry of the task, that are sampled beside the original."""
 
+    @property
+    def looks_once(self) -> bool:
+        """Whether what the agent sees of a frame never changes, so that the replay stores that."""
+        return False
+
+    def see(self, representation: Representation, observation: jax.Array) -> jax.Array:
+        """(..., *observation_shape) -> (..., D) what an agent that looks once sees of them."""
+        raise NotImplementedError
+
     @abc.abstractmethod
     def init_network(self, key: jax.Array) -> Params:
         """Fresh parameters of the network."""

@@ -48,6 +48,19 @@ class SAC(Agent):
         return self.options.rotated_copies
 
     @property
+    def looks_once(self) -> bool:
+        """Where psi's body is the trunk and stays as it is; a critic of states looks at those in every update."""
+        declared, options = self.declaration, self.options
+        from_psi = declared.uses_representation and self.config.information.start_from_psi and not declared.sees_state
+        return options.frozen_trunk and options.shared_trunk and from_psi and declared.critic is None
+
+    def see(self, representation: Representation, observation: jax.Array) -> jax.Array:
+        """The features of psi's body."""
+        shape = self.env.observation_spec.shape
+        seen = self._call("look_at", {"trunk": representation.psi}, observation.reshape(-1, *shape))
+        return seen.reshape(*observation.shape[: -len(shape)], -1)
+
+    @property
     def target_entropy(self) -> float:
         """In nats, of all dimensions."""
         return self.options.target_entropy * self.network.action_size
@@ -75,7 +88,7 @@ class SAC(Agent):
 
     def example_of_f(self, agent: Params) -> Tokens:
         """A token of zeros after the trunk: f looks through it too, but does not train it."""
-        return self.look(agent, self.example_tokens())
+        return self._look(agent, self.example_tokens())
 
     def epsilon(self, environment_steps: jax.Array) -> jax.Array:
         """() 0: the actor explores by itself."""
@@ -113,7 +126,7 @@ class SAC(Agent):
         tokens = Tokens(
             frames=observation, frame=None, previous_action=previous_action[:, None], reward=zeros.astype(jnp.float32),
             terminated=zeros > 0, truncated=zeros > 0, segment=zeros + 1, position=zeros, z_s=None)
-        encoded: Encoded = self._encode(params, self.look(params, tokens))
+        encoded: Encoded = self._encode(params, self._look(params, tokens))
         mean, _ = self._call("policy", params, encoded.actor)
         return jnp.min(self._call("values", params, encoded.critic, jnp.tanh(mean)), axis=0)
 
@@ -129,7 +142,13 @@ class SAC(Agent):
         return memory, jnp.where(jax.random.uniform(key_gate, (mean.shape[0], 1)) < epsilon, uniform, drawn)
 
     def look(self, agent: Params, tokens: Tokens) -> Tokens:
-        """The tokens with the trunk's features in the place of their frames: done once per update."""
+        """The tokens with the trunk's features in the place of their frames: done once per update, or before."""
+        if self.looks_once:
+            dtype = jnp.dtype(self.config.network.dtype)
+            return dataclasses.replace(tokens, frames=jnp.asarray(tokens.frames).astype(dtype))
+        return self._look(agent, tokens)
+
+    def _look(self, agent: Params, tokens: Tokens) -> Tokens:
         return cast(Tokens, self._call("look", agent, tokens))
 
     def loss(

@@ -43,6 +43,8 @@ class DivergenceError(RuntimeError):
 
 MANY_VALUES = 2**24
 """In frames that are encoded at once."""
+CLUB_START = 0.01
+"""Share of lambda_club that a ramp starts at."""
 CONSTANT = 1e-10
 """A variance of z_s below this is the rounding of its mean."""
 Weight = jax.Array | float
@@ -405,6 +407,13 @@ def initial_state(problem: Problem, key: jax.Array) -> TrainState:
         parameters, optimizer.init(parameters), EstimatorState(estimator, estimator_optimizer.init(estimator)))
 
 
+def club_growth(config: Stage1Config, fit: EstimatorState, updates: int) -> jax.Array:
+    """() the share of lambda_club that counts, when the estimator has been fitted so far of (whole training) `updates`
+    of the encoders: from `CLUB_START` to 1 over the first `club_ramp` of them."""
+    done = optax.tree.get(fit.optimizer, "count") / (config.estimator_updates * updates)
+    return CLUB_START ** jnp.maximum(1 - done / config.club_ramp, 0.0)
+
+
 Epoch = Callable[[LossWeights, TrainState, jax.Array], tuple[TrainState, Metrics]]
 """One pass over the data in a random order: (weights, state, key) -> (state, metrics of the last batch)."""
 
@@ -418,8 +427,12 @@ def make_epoch(problem: Problem) -> Epoch:
         optimizer, estimator_optimizer = optimizers(config, config.epochs * updates, weights.phi_shrinkage)
 
         def update(state: TrainState, draw: tuple[jax.Array, jax.Array]) -> tuple[TrainState, Metrics]:
+            current = weights
+            if config.club_ramp > 0:
+                growth = club_growth(config, state.estimator, config.epochs * updates)
+                current = dataclasses.replace(weights, lambda_club=weights.lambda_club * growth)
             gradients, (fit, metrics) = jax.grad(encoder_loss, has_aux=True)(
-                state.parameters, state.estimator, problem, weights, problem.batch(*draw), estimator_optimizer)
+                state.parameters, state.estimator, problem, current, problem.batch(*draw), estimator_optimizer)
             step, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
             parameters = cast(dict[str, Params], optax.apply_updates(state.parameters, step))
             return TrainState(parameters, optimizer_state, fit), metrics

@@ -31,7 +31,7 @@ def robot(domain: str, copies: int, epochs: int) -> Config:
         num_envs=2,
         stage1=Stage1Config(data="demonstrations", episodes=80, heldout_episodes=80, copies=copies, epochs=epochs,
                             batch_size=100, learning_rate=2e-3, rewarded=20, lambda_r=10.0, lambda_s=0.1, lambda_o=1.0,
-                            lambda_club=0.3, club_ramp=0.8, lambda_dim_s=0.1, lambda_dim_o=1.0),
+                            lambda_club=0.3, club_ramp=0.8, lambda_dim_s=0.1, lambda_dim_o=1.0, phi_shrinkage=0.0),
         network=NetworkConfig(action_embedding=16, observation_embedding=64, dropout=0.0),
         sac=SACConfig(demonstrations=80, rotated_copies=4),
         zp=SelfPredictionConfig(weight=0.1),

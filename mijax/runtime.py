@@ -1,7 +1,10 @@
 """What a command sets before JAX starts: host devices and the persistent compilation cache."""
 
+import ctypes
+import gc
 import os
 import pathlib
+import sys
 
 import jax
 
@@ -25,3 +28,15 @@ def prepare(host_devices: int = 1) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     if host_devices > 1 and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         jax.config.update("jax_num_cpu_devices", host_devices)
+
+
+def release_memory() -> None:
+    """Give memory that compiling has left over back to the system, where glibc can.
+
+    A CarFlag-2D learner keeps 978 MiB with it and 1 869 without: LLVM's heap is free, but stays with the process.
+    """
+    gc.collect()
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from envs_mjx.base import Environment
-from mijax import figures
+from mijax import figures, runtime
 from mijax.config import Stage1Config
 from mijax.metrics import ProgressDisplay, RunError, RunFolder
 from mijax.representation import DivergenceError, learn_representation
@@ -70,6 +70,7 @@ def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say
     timing = {"updates": history.updates, "updates_per_second": history.updates_per_second,
               "compile_seconds": history.compile_seconds, "seconds": history.seconds}
     _keep(folder, env, representation, report, timing)
+    runtime.release_memory()
     say(f"stage 1, seed {seed}: {history.updates} updates in {history.compile_seconds + history.seconds:.0f} s "
         f"({history.updates_per_second:.0f}/s), kept in {folder}\n{format_report(report)}")
     return report

@@ -186,6 +186,7 @@ def _start(
     else:
         run.truncate_after(-1)
         runner.init(learnt)
+        runtime.release_memory()
 
 
 def _loop(
@@ -232,6 +233,8 @@ def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[in
     results = runner.evaluate(config.evaluation.episodes)
     compiled_evaluation = clock.lap()
     ended = time.perf_counter()
+    if compiled + compiled_evaluation > 0:
+        runtime.release_memory()
     share = 1 / len(runner.seeds)
     wall = {"compile": compiled + compiled_evaluation, "training": trained - started - compiled,
             "evaluation": ended - trained - compiled_evaluation}

@@ -26,7 +26,7 @@ from configs.paper import STEPS
 from envs_mjx import registry
 from launch.experiments import EXPERIMENTS, GRID_WORLDS, Arm
 from mijax import episode, evaluate, figures, runtime, stage1, tables, train
-from mijax.config import ConfigError, config_from_dict, parse_seeds, require
+from mijax.config import ConfigError, Stage1Config, config_from_dict, parse_seeds, require
 from mijax.learner import make_learner
 from mijax.metrics import RunError, RunFolder
 from mijax.representation.dataset import collect
@@ -50,6 +50,12 @@ class Request:
     steps: int | None
     extra: tuple[str, ...]
     """Further options of `mijax.train`, for all runs."""
+    arms: tuple[str, ...] | None = None
+    """Which of an experiment's arms, by name; None: all."""
+
+    def wants(self, arm: Arm) -> bool:
+        """Whether an arm is to be run and drawn."""
+        return self.arms is None or arm.name in self.arms
 
     def parse(self, domain: str, arm: Arm) -> train.TrainOptions:
         """The options of an arm's training, without its folder and seeds."""
@@ -119,7 +125,7 @@ def shared_features(request: Request, domain: str, arm: Arm, options: train.Trai
     config, path = options.config, request.out / "runs" / domain.replace(":", ".") / f"features-{arm.features}"
     if (path / "config.json").exists():
         run = RunFolder.open(path)
-        if run.config()["stage1"] != dataclasses.asdict(config.stage1):
+        if Stage1Config(**run.config()["stage1"]) != config.stage1:
             raise RunError(f"{path}: was made with other --stage1 options; choose another --out")
     else:
         run = RunFolder.create(path, {"domain": domain, "stage1": dataclasses.asdict(config.stage1)})
@@ -168,12 +174,19 @@ def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
     groups: dict[str, list[ReportedRun]] = {}
     starts: dict[str, dict[str, int]] = {}
     steps: dict[str, int] = {}
+    missing: dict[str, None] = {}
     for number, domain in enumerate(domains, start=1):
-        for title, arms in experiment.groups(domain).items():
+        for title, every in experiment.groups(domain).items():
+            arms = [arm for arm in every if request.wants(arm)]
+            missing |= {arm.label: None for arm in every if arm not in arms}
+            if not arms:
+                continue
             groups[title] = [merged(arm, run_arm(request, domain, arm), request.seeds) for arm in arms]
             starts[title] = {arm.label: stage1_samples(request, domain, arm) for arm in arms}
             steps[domain] = request.parse(domain, arms[0]).config.steps
         note = note_on(request, domains[:number], steps)
+        if missing:
+            note += f". Left out: {', '.join(missing)}"
         if any(start for group in starts.values() for start in group.values()):
             note += ". Dashed vertical: stage 1's random steps end, task learning starts"
         figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note, starts=starts)
@@ -195,6 +208,7 @@ def command_line(name: str, request: Request) -> str:
     parts = [f"python -m launch.paper {name}", *([] if request.domain is None else [f"--domain {request.domain}"])]
     parts += [f"--seeds {','.join(map(str, request.seeds))},"]
     parts += [] if request.steps is None else [f"--steps {request.steps}"]
+    parts += [] if request.arms is None else [f"--arms {','.join(request.arms)}"]
     return " ".join([*parts, *request.extra])
 
 
@@ -251,6 +265,13 @@ def plan(what: str, domain: str | None) -> list[tuple[str, tuple[str, ...]]]:
             if GRID_WORLDS[number - 1] in EXPERIMENTS[name].domains]
 
 
+def arm_names(what: str, domain: str | None) -> list[str]:
+    """Of all curves that a command draws."""
+    panels = (panel for name, domains in plan(what, domain) for d in domains
+              for panel in EXPERIMENTS[name].groups(d).values())
+    return list(dict.fromkeys(arm.name for panel in panels for arm in panel))
+
+
 def parse(arguments: Sequence[str]) -> tuple[str, Request]:
     """The command line; what it does not know is passed on to `mijax.train`."""
     parser = argparse.ArgumentParser(
@@ -260,6 +281,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, Request]:
     parser.add_argument("--domain", help="one domain; default: those of the paper's figure")
     parser.add_argument("--seeds", default=str(PAPER_SEEDS), help="how many (5), or which ones (3,7; a single one: 3,)")
     parser.add_argument("--steps", type=int, help="environment steps of each run; default: the domain's preset")
+    parser.add_argument("--arms", help="some of the experiment's curves, such as mi,base; default: all")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/paper"), help="where to write")
     known, extra = parser.parse_known_args(list(arguments))
     accepted = ", ".join((*EXPERIMENTS, "all"))
@@ -272,7 +294,11 @@ def parse(arguments: Sequence[str]) -> tuple[str, Request]:
     if known.domain is not None:
         registry.make(known.domain)
     seeds = parse_seeds(known.seeds)
-    return known.experiment, Request(known.out, known.domain, seeds, known.steps, tuple(extra))
+    arms = None if known.arms is None else tuple(known.arms.split(","))
+    if arms is not None:
+        names = arm_names(known.experiment, known.domain)
+        require(set(arms) <= set(names), "arms", known.arms, f"some of {','.join(names)}")
+    return known.experiment, Request(known.out, known.domain, seeds, known.steps, tuple(extra), arms)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

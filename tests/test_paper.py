@@ -95,6 +95,14 @@ def test_what_is_there_is_not_made_again_and_seeds_are_added(done: pathlib.Path)
 
 
 @pytest.mark.slow
+def test_an_arm_can_be_left_out(done: pathlib.Path) -> None:
+    assert paper.main(["fig5", "--seeds", "1", "--arms", "mi", *command(done)]) == 0
+    text = (done / "fig5.md").read_text()
+    assert "Left out: Ours with a GRU" in text
+    assert "--arms mi" in text
+
+
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on(done: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = RunFolder.open(done / "runs/heaven_hell/mi-gru-400/seeds_0")
     summary = run.summary()
@@ -120,6 +128,7 @@ def test_a_run_that_was_stopped_goes_on(done: pathlib.Path, monkeypatch: pytest.
     (["fig3", "--domain", "mars"], "unknown domain 'mars'"),
     (["fig3", "--seeds", "x"], "--seeds: got 'x'"),
     (["fig3", "--steps", "0"], "--steps: got 0"),
+    (["fig3", "--arms", "mi,me"], "--arms: got 'mi,me', accepted: some of mi,base,zp,ba,ua,believer"),
     (["fig3", "--agent", "mi"], "--agent: got 'a value', accepted: nothing here"),
     (["fig5", "--domain", "heaven_hell", "--seeds", "1", "--steps", "400", *TINY, "--dqn.discount", "0.5"],
      "was made with --dqn.discount 0.97, wanted 0.5"),

@@ -37,7 +37,8 @@ from mijax.nets.encoders import encoder_for
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices
 from mijax.replay import Replay, StepRecord, sample_episodes
 from mijax.representation.dataset import collect, random_action
-from mijax.representation.train import LossWeights, Problem, initial_state, make_epoch
+from mijax.representation.problem import Problem
+from mijax.representation.train import LossWeights, initial_state, make_epoch
 from mijax.rollout import select
 from mijax.seeds import SeedRunner
 from mijax.types import Metrics, Representation

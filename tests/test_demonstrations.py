@@ -13,7 +13,7 @@ from mijax.demonstrations import demonstrate
 from mijax.representation import learn_representation
 from mijax.representation.dataset import Transitions, collect
 from mijax.representation.probe import probe
-from mijax.representation.train import Problem
+from mijax.representation.problem import Problem
 
 STEPS = 3
 

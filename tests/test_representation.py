@@ -19,8 +19,9 @@ from mijax.representation import DivergenceError, encode_observation, encode_sta
 from mijax.representation.dataset import Transitions, collect, tabulate
 from mijax.representation.model import evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
+from mijax.representation.problem import Problem
 from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
-from mijax.representation.train import EstimatorState, Problem, club_growth, encode, shrink
+from mijax.representation.train import EstimatorState, club_growth, encode, shrink
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
 

@@ -20,10 +20,10 @@ from envs_mjx.base import Environment
 from mijax.config import Stage1Config
 from mijax.representation.dataset import Transitions, collect
 from mijax.representation.probe import ProbeReport, probe_on
+from mijax.representation.problem import Problem
 from mijax.representation.train import (
     History,
     LossWeights,
-    Problem,
     TrainState,
     initial_state,
     make_epoch,

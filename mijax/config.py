@@ -275,8 +275,8 @@ class BelieverConfig:
     """Width of the history's summary x (Table 2: X-Dim)."""
     latent_width: int = 16
     """Width of the latent of the history VAE (Table 2: Z-Dim)."""
-    samples: int = 16
-    """Beliefs sampled per history."""
+    samples: int = 8
+    """Beliefs sampled per history; the paper does not say how many."""
     updates: int = 2000
     """Updates of the history VAE on random episodes, as many as stage 1's, before learning starts."""
     lambda_kl: float = 0.01

@@ -35,7 +35,7 @@ class Belief:
 
 
 class BeliefBranches(nn.Module):
-    """b beside psi(o), b the mean over samples z_s ~ p(z_s | h) of a learned embedding of each.
+    """b beside psi(o), b a function of the mean over samples z_s ~ p(z_s | h) of a learned embedding of each.
 
     p(z_s | h) is a variational autoencoder: a summary x of the history (Table 2: 16 wide) and a standard normal latent
     (Table 2: 16) decode to z_s, in units of its standard deviation. In gradient passes latents are drawn afresh.
@@ -53,7 +53,9 @@ class BeliefBranches(nn.Module):
         self.posterior = MLP(net.auxiliary_hidden, 2 * self.believer.latent_width, dtype)
         self.decoder = MLP(net.auxiliary_hidden, self.features, dtype)
         self.log_scale = _Scalar()
-        self.embed_sample = MLP(net.auxiliary_hidden, net.auxiliary_hidden[-1], dtype)
+        width = net.auxiliary_hidden[-1]
+        # One layer for each sample, the rest after the mean: samples times tokens are most of the agent's arithmetic.
+        self.embed_sample, self.embed_belief = nn.Dense(width, dtype=dtype), nn.Dense(width, dtype=dtype)
         self.bottom = self.make_bottom()
 
     def make_bottom(self) -> Any:
@@ -100,7 +102,7 @@ class BeliefBranches(nn.Module):
         noise = jnp.broadcast_to(noise, (x.shape[0], *noise.shape[1:])).astype(x.dtype)
         repeated = jnp.broadcast_to(x[:, None], (*noise.shape[:2], x.shape[-1]))
         z_s = self.decoder(jnp.concatenate([repeated, noise], axis=-1))
-        belief = jnp.mean(self.embed_sample(z_s), axis=1)
+        belief = nn.relu(self.embed_belief(jnp.mean(nn.relu(self.embed_sample(z_s)), axis=1)))
         return jnp.concatenate([belief, z_o.astype(belief.dtype)], axis=-1)
 
 

@@ -50,13 +50,15 @@ def take_copies(tokens: Tokens, copies: int, batch: int, key: jax.Array) -> Toke
     """Tokens of `batch` episodes, each in one of its copies, of a replay that stores what every copy shows.
 
     Args:
-        tokens: their frames are features (R L, 1 + copies, D), their actions and z_s (R, L, 1 + copies, ...).
+        tokens: their frames and states are features (R L, 1 + copies, D), actions and z_s (R, L, 1 + copies, ...).
         copies: besides the original.
     """
     copy = draw_copies(tokens, copies, batch, key)
     frames = _take(jnp.asarray(tokens.frames), copy.reshape(-1))
+    states = None if tokens.states is None else _take(tokens.states, copy.reshape(-1))
     z_s = None if tokens.z_s is None else _take(tokens.z_s, copy)
-    return dataclasses.replace(tokens, frames=frames, previous_action=_take(tokens.previous_action, copy), z_s=z_s)
+    return dataclasses.replace(
+        tokens, frames=frames, states=states, previous_action=_take(tokens.previous_action, copy), z_s=z_s)
 
 
 def _take(x: jax.Array, copy: jax.Array) -> jax.Array:

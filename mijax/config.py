@@ -13,6 +13,7 @@ PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
 IntrinsicForm = Literal["explained_variance", "cosine"]
 DataSource = Literal["random", "demonstrations"]
 """Whose episodes stage 1 learns from: a random policy's, or those of the environment's expert."""
+TrunkKind = Literal["own", "shared", "psi"]
 SeedStrategy = Literal["auto", "map", "vmap", "shard"]
 
 
@@ -214,12 +215,11 @@ class SACConfig:
     rotated_copies: int = 0
     """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
     original (paper: 4 on the robots)."""
-    shared_trunk: bool = True
-    """Whether frames are encoded once per update, for the actor, the critics, their targets and f, with a last layer of
-    its own for each branch. Otherwise each branch has a whole encoder (the paper)."""
-    frozen_trunk: bool = False
-    """Whether a shared trunk that starts from psi stays as it is. The replay then stores its features, in every copy of
-    an episode, and no update looks at a frame. Agents that do not start from psi train theirs all the same."""
+    trunk: TrunkKind = "shared"
+    """How frames are encoded. own: by a whole encoder in each branch (paper). shared: once per update, for the actor,
+    the critics, their targets and f, with a last layer of its own for each branch; the trunk starts from psi where the
+    agent does. psi: the trunk is psi's body and stays so, for every agent, as phi's is the state's for a critic that
+    sees states; the replay stores their features, in every copy of an episode, and no update looks at a frame."""
     critic_norm: bool = True
     """Whether the critics' hidden layers are normalised, which keeps values of unseen actions in bounds (paper: no)."""
     bootstrap_at_time_limit: bool = False

@@ -22,6 +22,7 @@ from mijax.agents.variants import variant
 from mijax.augmentation import show_copy, show_tokens, shows_again, take_copies
 from mijax.config import Config
 from mijax.frames import FrameTable
+from mijax.nets.actor_critic import shown
 from mijax.nets.encoders import encoder_for
 from mijax.nets.privileged import StateShown
 from mijax.packing import Layout, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
@@ -182,6 +183,7 @@ class Learner:
     def recorder(self, representation: Representation | None) -> Recorder:
         """What the replay stores, z_s among it when there is a representation."""
         phi = encoder_for(self.env.state_spec, self.config.stage1.features)
+        psi = encoder_for(self.env.observation_spec, self.config.stage1.features)
         spec, copies = self.env.action_spec, self.agent.copies
         action_type = _integer_for(spec.num) if isinstance(spec, DiscreteActions) else jnp.float32
         table, declaration = self.observations, self.agent.declaration
@@ -199,12 +201,17 @@ class Learner:
             timestep: TimeStep, previous_action: jax.Array, env_state: EnvState = None,
             symmetry: jax.Array | None = None,
         ) -> StepRecord:
-            z_s, observation = None, env_state if self.moments else timestep.observation
+            z_s, observation, state = None, env_state if self.moments else timestep.observation, timestep.state
             if representation is not None and not declaration.sees_state:
-                shown, actions = in_copies(timestep, previous_action, env_state, symmetry)
-                z_s = cast(jax.Array, phi.apply({"params": representation.phi}, shown.state))
+                copied, actions = in_copies(timestep, previous_action, env_state, symmetry)
+                if declaration.uses_representation:
+                    z_s = cast(jax.Array, phi.apply({"params": representation.phi}, copied.state))
                 if self.agent.looks_once:
-                    observation = self.agent.see(representation, shown.observation).astype(jnp.float16)
+                    seen = shown(copied.observation, self.env.observation_spec)
+                    observation, state = (
+                        cast(jax.Array, encoder.apply({"params": params}, x, method="body")).astype(jnp.float16)
+                        for encoder, params, x in ((psi, representation.psi, seen),
+                                                   (phi, representation.phi, copied.state)))
                     previous_action = actions
             if table is not None:
                 observation = table.index_of(timestep.observation).astype(_integer_for(len(table)))
@@ -215,7 +222,7 @@ class Learner:
                 terminated=timestep.terminated,
                 truncated=timestep.truncated,
                 z_s=z_s,
-                state=None if declaration.critic is None or self.moments else timestep.state,
+                state=None if declaration.critic is None or self.moments else state,
                 symmetry=symmetry,
             )
 

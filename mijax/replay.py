@@ -27,7 +27,7 @@ class StepRecord:
     truncated: jax.Array  # (E,) bool, on arriving
     z_s: jax.Array | None  # (E, F) phi(s_t), labelled once on collection, or (E, 1 + copies, F) in each copy of the
     # episode; None when the agent does not use it
-    state: jax.Array | None = None  # (E, *state_shape); None but for asymmetric critics
+    state: jax.Array | None = None  # (E, *state_shape), or features as of observations; None but for asymmetric critics
     symmetry: jax.Array | None = None  # (E, 2) uint32, the same in all steps of an episode: see `mijax.augmentation`
 
 

@@ -255,9 +255,9 @@ SEEN = {  # agent: what the actor's choice at the last token of an episode depen
 }
 
 
-@pytest.mark.parametrize(("name", "shared_trunk"), [*((name, True) for name in VARIANTS), ("mi", False), ("ua", False)])
-def test_what_each_network_sees(name: str, shared_trunk: bool):
-    case = Case(name, sac=dataclasses.replace(CONFIG.sac, shared_trunk=shared_trunk))
+@pytest.mark.parametrize(("name", "trunk"), [*((name, "shared") for name in VARIANTS), ("mi", "own"), ("ua", "own")])
+def test_what_each_network_sees(name: str, trunk: Any):
+    case = Case(name, sac=dataclasses.replace(CONFIG.sac, trunk=trunk))
     t, zero = 3, jnp.zeros((2, ROW, ACTIONS))  # the last token of the first episode of row 0
     shown = 3 if name == "mdp" else 0  # entries of the state in an observation
     frames, states = np.array(case.tokens.frames), np.array(case.tokens.states)
@@ -298,15 +298,15 @@ def test_step_by_step_equals_the_full_pass(name: str, memory: Any):
 
 def test_psi_starts_the_trunk_and_every_memoryless_branch():
     env, rep = Shapes(), representation(Shapes())
-    for shared in (True, False):
-        config = dataclasses.replace(CONFIG, sac=dataclasses.replace(CONFIG.sac, shared_trunk=shared))
+    body = {name: part for name, part in rep.psi.items() if name != "output"}
+    for name, trunk in (("mi", "shared"), ("mi", "own"), ("base", "psi")):
+        config = dataclasses.replace(CONFIG, agent=name, sac=dataclasses.replace(CONFIG.sac, trunk=trunk))
         agent = jax.jit(make_agent(env, config).init)(jax.random.key(3), rep).params["agent"]
-        body = {name: part for name, part in rep.psi.items() if name != "output"}
-        for branch in ("actor", "critic"):
-            expected = rep.psi["output"] if shared else rep.psi
+        for branch in ("actor", "critic") if name == "mi" else ():
+            expected = rep.psi if trunk == "own" else rep.psi["output"]
             jax.tree.map(np.testing.assert_array_equal, agent[branch]["bottom"], expected)
-        assert ("trunk" in agent) == shared
-        if shared:
+        assert ("trunk" in agent) == (trunk != "own")
+        if trunk != "own":
             jax.tree.map(np.testing.assert_array_equal, agent["trunk"], body)
 
 
@@ -396,7 +396,7 @@ def test_a_sampled_copy_is_turned_as_a_whole(ours: tuple[Run, LearnerState]):
 def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
     """The replay holds what psi's body says of each copy; updates get that, and leave the trunk alone."""
     run, state = ours
-    frozen = Run(dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, frozen_trunk=True)))
+    frozen = Run(dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, trunk="psi")))
     start = frozen.start()
     slots = state.replay.finished[jnp.zeros((8,), jnp.int32)]
 
@@ -405,7 +405,9 @@ def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
 
     shown, seen = read(run, state), read(frozen, start)
     real = np.asarray(shown.segment).reshape(-1) > 0
-    wanted = frozen.learner.agent.see(run.representation, jnp.asarray(shown.frames))  # pyright: ignore[reportArgumentType]
+    assert run.representation is not None
+    psi = networks_for(Compass(), FEATURES).psi
+    wanted = psi.apply({"params": run.representation.psi}, jnp.asarray(shown.frames), method="body")
     np.testing.assert_allclose(np.asarray(seen.frames)[real], np.asarray(wanted)[real], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(seen.previous_action, shown.previous_action, atol=1e-6)
     np.testing.assert_allclose(
@@ -418,10 +420,12 @@ def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
 
 
 @pytest.mark.lenient
-@pytest.mark.parametrize("agent", [
-    "ua", pytest.param("believer", marks=pytest.mark.slow), pytest.param("mdp", marks=pytest.mark.slow)])
-def test_every_agent_runs_in_the_loop(agent: str):
-    run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", stage1=Stage1Config(features=FEATURES, episodes=4)))
+@pytest.mark.parametrize(("agent", "trunk"), [
+    ("ua", "psi"), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (
+        ("ua", "shared"), ("believer", "shared"), ("believer", "psi"), ("base", "psi"), ("mdp", "shared")))])
+def test_every_agent_runs_in_the_loop(agent: str, trunk: Any):
+    run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", sac=dataclasses.replace(LOOP.sac, trunk=trunk),
+                                  stage1=Stage1Config(features=FEATURES, episodes=4)))
     state, metrics = run.chunk(run.start())
     assert int(state.agent.updates) == 12
     assert all(np.isfinite(x) for name, x in jax.device_get(metrics).items() if name.startswith(("loss/", "actor/")))

@@ -84,10 +84,6 @@ class Agent(abc.ABC):
         """Whether what the agent sees of a frame never changes, so that the replay stores that."""
         return False
 
-    def see(self, representation: Representation, observation: jax.Array) -> jax.Array:
-        """(..., *observation_shape) -> (..., D) what an agent that looks once sees of them."""
-        raise NotImplementedError
-
     @abc.abstractmethod
     def init_network(self, key: jax.Array) -> Params:
         """Fresh parameters of the network."""

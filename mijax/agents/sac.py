@@ -49,16 +49,8 @@ class SAC(Agent):
 
     @property
     def looks_once(self) -> bool:
-        """Where psi's body is the trunk and stays as it is; a critic of states looks at those in every update."""
-        declared, options = self.declaration, self.options
-        from_psi = declared.uses_representation and self.config.information.start_from_psi and not declared.sees_state
-        return options.frozen_trunk and options.shared_trunk and from_psi and declared.critic is None
-
-    def see(self, representation: Representation, observation: jax.Array) -> jax.Array:
-        """The features of psi's body."""
-        shape = self.env.observation_spec.shape
-        seen = self._call("look_at", {"trunk": representation.psi}, observation.reshape(-1, *shape))
-        return seen.reshape(*observation.shape[: -len(shape)], -1)
+        """Where psi's body is the trunk and stays as it is."""
+        return self.options.trunk == "psi" and not self.declaration.sees_state
 
     @property
     def target_entropy(self) -> float:
@@ -79,12 +71,22 @@ class SAC(Agent):
             if self.config.mdp.sees != "state":
                 return agent | {"features": {"phi": representation.phi, "psi": representation.psi}}
             return agent
-        if not (self.declaration.uses_representation and self.config.information.start_from_psi):
-            return agent
-        psi = dict(representation.psi)
-        bottom = psi if "trunk" not in agent else psi.pop("output")
-        branches = {name: agent[name] | {"bottom": bottom} for name in ("actor", "critic", "history") if name in agent}
-        return agent | branches | ({"trunk": psi} if "trunk" in agent else {})
+        from_psi = self.declaration.uses_representation and self.config.information.start_from_psi
+        psi, started = dict(representation.psi), {}
+        bottom = psi.pop("output") if "trunk" in agent else representation.psi
+        if from_psi:
+            branches = (name for name in ("actor", "critic", "history") if name in agent)
+            started = {name: agent[name] | {"bottom": bottom} for name in branches}
+        if "trunk" in agent and (from_psi or self.looks_once):
+            started["trunk"] = psi
+        return agent | started
+
+    def example_tokens(self) -> Tokens:
+        """One token of zeros; its state is what the critics see of it."""
+        tokens = super().example_tokens()
+        if not self.looks_once:
+            return tokens
+        return dataclasses.replace(tokens, states=jnp.zeros((1, *_body_spec(self.env.state_spec).shape)))
 
     def example_of_f(self, agent: Params) -> Tokens:
         """A token of zeros after the trunk: f looks through it too, but does not train it."""
@@ -240,12 +242,9 @@ def _network(env: Environment, config: Config, declaration: Variant) -> ActorCri
     if declaration.sees_state:
         seen = PrivilegedFeatures(env.state_spec, spec, features, config.mdp.sees)
         return PrivilegedActorCritic(size, net, spec, norm, features=seen)
-    trunk = encoder_for(spec, features, dtype) if config.sac.shared_trunk else None
-    branch_spec = spec
-    if trunk is not None:
-        example = jnp.zeros((1, *spec.shape), spec.dtype)
-        looked, _ = jax.eval_shape(lambda: trunk.init_with_output(jax.random.key(0), example, method="body"))
-        branch_spec = ArraySpec(looked.shape[1:])
+    trunk = encoder_for(spec, features, dtype) if config.sac.trunk != "own" else None
+    branch_spec = spec if trunk is None else _body_spec(spec)
+    state_spec = _body_spec(env.state_spec) if config.sac.trunk == "psi" else env.state_spec
     history = HistoryEncoder(size, env.horizon + 1, memory_of(config), net)
     if declaration.believes:
         belief = BeliefBranches(history, branch_spec, features, config.believer, after_trunk=trunk is not None)
@@ -259,7 +258,14 @@ def _network(env: Environment, config: Config, declaration: Variant) -> ActorCri
 
     return TwoBranchActorCritic(
         size, net, spec, norm, trunk, actor=branch(), critic=None if declaration.critic == "state" else branch(),
-        critic_sees=declaration.critic, state_spec=env.state_spec, actor_moves_trunk=declaration.critic is not None)
+        critic_sees=declaration.critic, state_spec=state_spec, actor_moves_trunk=declaration.critic is not None)
+
+
+def _body_spec(spec: ArraySpec) -> ArraySpec:
+    """What the body of an encoder makes of an array."""
+    example, body = jnp.zeros((1, *spec.shape), spec.dtype), encoder_for(spec, 1)
+    looked, _ = jax.eval_shape(lambda: body.init_with_output(jax.random.key(0), example, method="body"))
+    return ArraySpec(looked.shape[1:])
 
 
 def make_sac(env: Environment, config: Config) -> SAC:

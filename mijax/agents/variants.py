@@ -63,7 +63,10 @@ def variant(name: str) -> Variant:
 
 def needs_representation(config: Config) -> bool:
     """Whether stage 1 has to come first."""
-    return variant(config.agent).uses_representation and not (config.agent == "mdp" and config.mdp.sees == "state")
+    declaration = variant(config.agent)
+    if declaration.sees_state:
+        return config.mdp.sees != "state"
+    return declaration.uses_representation or config.sac.trunk == "psi"
 
 
 def memory_of(config: Config) -> MemoryKind:

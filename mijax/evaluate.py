@@ -20,6 +20,7 @@ from envs_mjx.base import Environment, EnvState
 from envs_mjx.grid import draw
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, evaluate_robot, runtime, stage1
+from mijax.agents.forgetful import Forgetful
 from mijax.agents.variants import memory_of, needs_representation
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
 from mijax.learner import Learner, LearnerState, make_learner
@@ -31,7 +32,7 @@ USER_ERRORS = (ConfigError, RunError, RepresentationError, registry.UnknownDomai
                draw.NoDrawing, OSError)
 """What a user can mend: shown as one line."""
 EPISODE_FILE = "episode.gif"
-COLUMNS = ("success", "return", "discounted_return", "of_optimum", "length", "reveals")
+COLUMNS = ("success", "return", "discounted_return", "of_optimum", "length", "reveals", *evaluate_robot.HALVES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +52,9 @@ class EvaluateOptions:
     """The robot task of --planner and --random: block_pulling, block_pushing or drawer_opening."""
     episodes: int = 500
     """Episodes per seed."""
+    remember: int = 0
+    """Steps, the present one among them, that the agent may remember: at each it acts as if the episode had begun so
+    many steps ago. 0: all. An agent that remembers falls to a guess with 2."""
     seeds: str | None = None
     """Which seeds (0,1; a single one with a comma: 3,) or the first so many (2); default all of the run's."""
     gif: bool = False
@@ -110,10 +114,16 @@ def play(learner: Learner, state: LearnerState, key: jax.Array) -> list[EnvState
     return [first, *(jax.tree.map(lambda x, t=t: x[t], later) for t in range(int(np.argmax(done)) + 1))]
 
 
-def evaluate_seed(learner: Learner, state: LearnerState, key: jax.Array, episodes: int) -> dict[str, float]:
-    """Means over greedy episodes, and the discounted return in fractions of the best possible where that is known."""
-    program = jax.jit(learner.evaluate, static_argnums=2)
+def evaluate_seed(
+    learner: Learner, state: LearnerState, key: jax.Array, episodes: int, remember: int = 0
+) -> dict[str, float]:
+    """Means over greedy episodes, the discounted return in fractions of the best possible where that is known, and of a
+    robot task the success by what was touched first; `remember`: see `EvaluateOptions`."""
+    actor = Forgetful(learner.agent, remember) if remember else learner.agent
+    program = jax.jit(functools.partial(learner.evaluate, actor=actor), static_argnums=2)
     results = {name: float(np.mean(values)) for name, values in program(state, key, episodes).items()}
+    if evaluate_robot.is_robot(learner.env):
+        results |= evaluate_robot.halves(learner.env, actor, state.agent.target, key, episodes)
     best = optimum(learner.domain, learner.config.evaluation.discount)
     if best is not None:
         results["of_optimum"] = results["discounted_return"] / best.discounted_return
@@ -147,6 +157,7 @@ def show(env: Environment, states: Sequence[EnvState], title: str, gif: pathlib.
 def check(options: EvaluateOptions) -> None:
     """Raise `ConfigError` for options that do not go together, before any work."""
     require(options.episodes >= 1, "episodes", options.episodes, "a number >= 1")
+    require(options.remember >= 0, "remember", options.remember, "a number >= 1, or 0 for all")
     require(not (options.planner and options.random), "random", True, "--planner or --random, not both")
     if not (options.planner or options.random):
         require(options.run is not None, "run", None, "a run folder, or --planner or --random with --domain")
@@ -186,7 +197,8 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
     for seed in seeds:
         step, state = load_learner_state(run, seed, learner)
         key = evaluation_key(seed, step)
-        rows[str(seed)], steps[str(seed)] = evaluate_seed(learner, state, key, options.episodes), step
+        rows[str(seed)], steps[str(seed)] = evaluate_seed(
+            learner, state, key, options.episodes, options.remember), step
         if options.gif or options.text:
             gif = run.seed_path(seed) / EPISODE_FILE if options.gif else None
             show(learner.domain, play(learner, state, key), f"seed {seed}, step {step:,}", gif, options.text)

@@ -1,5 +1,6 @@
 """`python -m mijax.evaluate --planner` and `--random`: a robot task's expert, or random actions, measured."""
 
+import functools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -14,11 +15,15 @@ from envs_mjx.base import Environment, EnvState
 from envs_mjx.grid import draw
 from mijax.config import require
 from mijax.metrics import RunError
+from mijax.rollout import Actor
+from mijax.types import Params
 
 if TYPE_CHECKING:
     from envs_mjx.robot.trial import Trial
 
 EPISODE_FILE, PAGE_FILE = "planner.gif", "planner.html"
+HALVES = ("movable_first", "immovable_first")
+"""Success by what is touched first."""
 DEMONSTRATED = ", ".join(configs.ROBOTS)
 
 
@@ -91,6 +96,19 @@ def evaluate_random(domain: str, episodes: int, say: Callable[[str], None]) -> "
     say(_endings(played))
     say(f"frames shown with a number that is not finite: {played.not_finite}")
     return played
+
+
+def halves(env: Environment, actor: Actor, params: Params, key: jax.Array, episodes: int) -> dict[str, float]:
+    """Success of greedy episodes by which object was touched first, the movable or the immovable one; left out where
+    that never happened."""
+    from envs_mjx.robot import trial
+
+    played = trial.policy_trial(
+        env, functools.partial(actor.act, params), actor.initial_memory, actor.no_action,  # pyright: ignore[reportArgumentType]
+        key, episodes)
+    assert played.movable_first is not None
+    rows = zip(HALVES, (played.touched & played.movable_first, played.touched & ~played.movable_first), strict=True)
+    return {name: float(played.success[which].mean()) for name, which in rows if which.any()}
 
 
 def _endings(played: "Trial") -> str:

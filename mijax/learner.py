@@ -28,6 +28,7 @@ from mijax.nets.privileged import StateShown
 from mijax.packing import Layout, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, StepRecord, fill, init_replay, sample_episodes, write
 from mijax.rollout import (
+    Actor,
     Episodes,
     EpisodeTotals,
     Recorder,
@@ -176,9 +177,10 @@ class Learner:
         steps = self.iterations_per_chunk * self.config.steps_per_iteration
         return self._collect(state, self.epsilon(self.environment_steps(state)), steps, state.key)[1]
 
-    def evaluate(self, state: LearnerState, key: jax.Array, num_episodes: int) -> Metrics:
-        """Greedy episodes of the averaged network: per-episode results, each (num_episodes,)."""
-        return evaluate(self.env, self.agent, state.agent.target, num_episodes, key)
+    def evaluate(self, state: LearnerState, key: jax.Array, num_episodes: int, actor: Actor | None = None) -> Metrics:
+        """Greedy episodes of the averaged network: per-episode results, each (num_episodes,); `actor`: played by
+        another than the agent."""
+        return evaluate(self.env, actor or self.agent, state.agent.target, num_episodes, key)
 
     def recorder(self, representation: Representation | None) -> Recorder:
         """What the replay stores, z_s among it when there is a representation."""

@@ -1,7 +1,7 @@
 """Running environments: collecting experience into the replay, and greedy evaluation."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ from flax import struct
 
 from envs_mjx.base import Environment, EnvState, TimeStep
 from mijax.agents.core import Agent
+from mijax.config import Config
 from mijax.nets.two_branch import MemoryState
 from mijax.replay import Replay, StepRecord, finish, write
 from mijax.types import Metrics, Params
@@ -18,13 +19,43 @@ Recorder = Callable[..., StepRecord]
 are stored, their states and the symmetries of their episodes."""
 
 
+class Actor(Protocol):
+    """What plays greedily: an agent, or one that forgets; see `mijax.agents.core.Agent`."""
+
+    @property
+    def config(self) -> Config:
+        """Of the run."""
+        ...
+
+    @property
+    def copies(self) -> int:
+        """Of each episode, that the replay stores."""
+        ...
+
+    def no_action(self, batch: int) -> jax.Array:
+        """The previous action of episodes that have not started."""
+        ...
+
+    def initial_memory(self, batch: int) -> Any:
+        """What such episodes remember."""
+        ...
+
+    def act(self, params: Params, memory: Any, observation: jax.Array, previous_action: jax.Array) -> tuple:
+        """New memory and greedy actions."""
+        ...
+
+    def value(self, params: Params, memory: Any, observation: jax.Array, previous_action: jax.Array) -> jax.Array:
+        """What is promised of episodes after their first observation."""
+        ...
+
+
 @struct.dataclass
 class Episodes:
     """The open episode of each of E environments."""
 
     env_state: EnvState  # leading axis E
     timestep: TimeStep  # leading axis E
-    memory: MemoryState  # leading axis E
+    memory: MemoryState | Any  # leading axis E
     previous_action: jax.Array  # (E,) int32, -1 at the start; or (E, A) float32, 0 at the start
     position: jax.Array  # (E,) int32, steps since the start
     returns: jax.Array  # (E,) float32, undiscounted so far
@@ -63,7 +94,7 @@ def select(which: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, old)
 
 
-def start_episodes(env: Environment, agent: Agent, num_envs: int, key: jax.Array) -> Episodes:
+def start_episodes(env: Environment, agent: Actor, num_envs: int, key: jax.Array) -> Episodes:
     """Reset every environment."""
     env_state, timestep = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     return Episodes(
@@ -116,7 +147,7 @@ def collect_step(
     return episodes, write(replay, first, episodes.position, keep=done), totals
 
 
-def evaluate(env: Environment, agent: Agent, params: Params, num_episodes: int, key: jax.Array) -> Metrics:
+def evaluate(env: Environment, agent: Actor, params: Params, num_episodes: int, key: jax.Array) -> Metrics:
     """Greedy episodes, side by side: per-episode results, each (num_episodes,).
 
     The discounted return is sum_t gamma^t r_{t+1}; `value` is what the agent promises itself of it, and of the bonus,

@@ -5,6 +5,7 @@ import json
 import pathlib
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,6 +13,7 @@ from PIL import Image
 from envs_mjx import registry
 from envs_mjx.grid.optimal import optimum
 from mijax import evaluate
+from mijax.agents.forgetful import Forgetful
 from mijax.checkpoint import Checkpoints
 from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig
 from mijax.learner import make_learner
@@ -63,7 +65,34 @@ def test_the_table_holds_what_the_learner_measures(run: pathlib.Path, capsys: py
     best = optimum(LEARNER.env, CONFIG.evaluation.discount)
     assert best is not None
     means["of_optimum"] = means["discounted_return"] / best.discounted_return
-    assert lines[1].split() == ["3", str(STEP), *(f"{means[name]:.3f}" for name in evaluate.COLUMNS)]
+    assert lines[1].split() == ["3", str(STEP), *(f"{means[name]:.3f}" for name in evaluate.COLUMNS if name in means)]
+
+
+def test_a_cut_memory_is_an_episode_that_began_later():
+    """Up to the cut both act alike; then as if the oldest step that is remembered were the first."""
+    agent, params, kept = LEARNER.agent, jax.jit(LEARNER.agent.init)(jax.random.key(0), None).target, 3
+    cut, act = Forgetful(agent, kept), jax.jit(agent.act)
+    spec = LEARNER.env.observation_spec
+    seen = jax.random.uniform(jax.random.key(1), (5, 2, *spec.shape), minval=0.0, maxval=9.0).astype(spec.dtype)
+    before = jnp.array([[-1, -1], [0, 1], [2, 3], [1, 1], [3, 0]], jnp.int32)
+
+    def told(first: int, last: int) -> np.ndarray:
+        """The agent's memory after steps `first` to `last`."""
+        memory = agent.initial_memory(2)
+        for step in range(first, last + 1):
+            memory, _ = act(params, memory, seen[step], before[step])
+        return np.asarray(memory.recurrent)
+
+    window = cut.initial_memory(2)
+    for step in range(5):
+        window, action = jax.jit(cut.act)(params, window, seen[step], before[step])
+        first = max(0, step - kept + 1)
+        memory = agent.initial_memory(2)
+        expected = jnp.zeros(2, jnp.int32)
+        for earlier in range(first, step + 1):
+            memory, expected = act(params, memory, seen[earlier], before[earlier])
+        np.testing.assert_array_equal(action, expected)
+    assert np.abs(told(0, 4) - told(2, 4)).max() > 1e-3
 
 
 def test_an_episode_is_drawn_and_printed(run: pathlib.Path, capsys: pytest.CaptureFixture[str]):
@@ -87,6 +116,7 @@ def test_what_cannot_be_evaluated_is_named(
     run: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ):
     assert "no such run folder" in failure(capsys, str(tmp_path / "nothing"))
+    assert "--remember: got -1" in failure(capsys, str(run), "--remember", "-1")
     assert "--episodes: got 0" in failure(capsys, str(run), "--episodes", "0")
     assert "has no seed 7 (it has 0, 3)" in failure(capsys, str(run), "--seeds", "0,7")
     fresh = RunFolder.create(tmp_path / "fresh", dataclasses.asdict(CONFIG) | {"seed_list": [0], "track": "none"})

@@ -16,6 +16,7 @@ from envs_mjx.robot import BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
 from envs_mjx.robot.planner import PLANS, Planner, Trajectory
 from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, SUCCESS, TIME_LIMIT, RobotState, RobotTask
+from envs_mjx.robot.trial import policy_trial
 from mijax.demonstrations import demonstrate
 
 DOMAINS = configs.ROBOTS
@@ -301,3 +302,37 @@ def test_200_episodes_in_mujoco_c(domain: str) -> None:
         errors.append(largest_object_error(env, episode, places))
     assert np.mean(agree) >= 0.98
     assert np.mean(np.array(errors) < 0.005) >= 0.98
+
+
+@pytest.mark.slow
+@pytest.mark.lenient
+def test_a_trial_of_a_policy_tells_what_was_touched_first():
+    """Against one episode after the other, of a gripper that goes down and to one side."""
+    env = make("block_pulling")
+    key, episodes = jax.random.key(5), 20
+    towards = jnp.array([0.0, -1.0, -1.0, 0.0])
+
+    def act(memory, observation, previous_action):
+        return memory + 1, jnp.broadcast_to(towards, previous_action.shape)
+
+    played = policy_trial(
+        env, act, lambda batch: jnp.zeros(batch, jnp.int32), lambda batch: jnp.zeros((batch, 4)), key, episodes)
+    keys = jax.random.split(key, (2, 16)).reshape(-1)[:episodes]
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    for number in range(4):
+        env_state, _ = reset(keys[number])
+        first = None
+        for time in range(env.horizon):
+            later, timestep = step(jax.random.fold_in(keys[number], time), env_state, towards)
+            if first is None and bool(later.touched):
+                apart = np.linalg.norm(np.asarray(env.object_poses(later))[:, :2] - np.asarray(later.qpos)[:2], axis=1)
+                first = int(np.argmin(apart)) == int(later.movable)
+            env_state = later
+            if bool(timestep.done):
+                break
+        assert played.length[number] == int(env_state.time)
+        assert played.outcome[number] == int(env_state.outcome)
+        assert np.asarray(played.touched)[number] == (first is not None)
+        if first is not None:
+            assert played.movable_first is not None
+            assert played.movable_first[number] == first

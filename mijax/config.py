@@ -211,7 +211,9 @@ class SACConfig:
     warmup_episodes: int = 2
     """Random episodes before the first update."""
     demonstrations: int = 0
-    """Episodes of the environment's expert in the replay from the start (paper: 80 on the robots)."""
+    """Episodes of the environment's expert in the replay from the start, for good (paper: 80 on the robots)."""
+    demonstration_share: float = 0.0
+    """Probability with which an episode of a batch is drawn among the demonstrations alone (paper: 0)."""
     rotated_copies: int = 0
     """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
     original (paper: 4 on the robots)."""
@@ -231,7 +233,7 @@ class SACConfig:
         for name in ("learning_rate", "updates_per_step", "initial_temperature"):
             require(getattr(self, name) > 0, f"sac.{name}".replace("_", "-"), getattr(self, name), "a number > 0")
         require(self.batch_episodes % 2 == 0, "sac.batch-episodes", self.batch_episodes, "an even number")
-        for name in ("discount", "trace_decay", "target_rate", "final_learning_rate"):
+        for name in ("discount", "trace_decay", "target_rate", "final_learning_rate", "demonstration_share"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"sac.{name}".replace("_", "-"), value, "a number in [0, 1]")
 

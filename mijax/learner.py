@@ -70,8 +70,8 @@ class Learner:
         num_envs = self.config.num_envs
         episodes = start_episodes(self.env, self.agent, num_envs, key_start)
         first = self._first(representation, episodes)
-        capacity = max(num_envs, self.demonstrations, self.agent.options.replay_steps // self.env.horizon)
-        replay = init_replay(first, capacity, self.env.horizon)
+        capacity = max(num_envs + self.demonstrations, self.agent.options.replay_steps // self.env.horizon)
+        replay = init_replay(first, capacity, self.env.horizon, kept=self.demonstrations)
         if self.demonstrations:
             replay = self._demonstrate(replay, representation, jax.random.fold_in(key_start, 1))
         state = LearnerState(
@@ -261,7 +261,8 @@ class Learner:
         apply: Callable = self.agent.pretrain if pretrain else self.agent.update
         batch = self.agent.options.batch_episodes
         key_sample, key_loss = jax.random.split(key)
-        slots = sample_episodes(replay, key_sample, batch)
+        share = self.config.sac.demonstration_share if self.demonstrations else 0.0
+        slots = sample_episodes(replay, key_sample, batch, share)
         if not self.pack:
             return apply(agent, self._read(replay, slots, one_per_row(batch), batch, key), representation, key_loss)
         layout = fit_folds(replay.length[slots], replay.data.reward.shape[1])

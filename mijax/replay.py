@@ -40,6 +40,7 @@ class Replay:
     finished: jax.Array  # (capacity,) int32, slots of finished episodes, a ring in order of completion
     open_slots: jax.Array  # (E,) int32, the slot each environment is writing
     count: jax.Array  # () int32, episodes ever finished
+    kept: int = struct.field(pytree_node=False, default=0)  # first places of the ring, which are never overwritten
 
     @property
     def capacity(self) -> int:
@@ -47,11 +48,13 @@ class Replay:
         return self.finished.shape[0]
 
 
-def init_replay(example: StepRecord, capacity: int, horizon: int) -> Replay:
-    """An empty replay for records shaped like `example`, whose leading axis is the environments'."""
+def init_replay(example: StepRecord, capacity: int, horizon: int, kept: int = 0) -> Replay:
+    """An empty replay for records shaped like `example`, whose leading axis is the environments'; the first `kept`
+    episodes that finish (demonstrations) stay for ever."""
     num_envs = example.reward.shape[0]
-    if capacity < num_envs:
-        raise ValueError(f"a replay of {capacity} episodes cannot serve {num_envs} environments that end at once")
+    if capacity < num_envs + kept:
+        raise ValueError(f"a replay of {capacity} episodes cannot serve {num_envs} environments that end at once"
+                         + (f" beside {kept} that are kept" if kept else ""))
     slots = capacity + num_envs
     data = jax.tree.map(lambda x: jnp.zeros((slots, horizon + 1, *x.shape[1:]), x.dtype), example)
     return Replay(
@@ -60,6 +63,7 @@ def init_replay(example: StepRecord, capacity: int, horizon: int) -> Replay:
         finished=jnp.zeros((capacity,), jnp.int32),
         open_slots=jnp.arange(num_envs, dtype=jnp.int32),
         count=jnp.zeros((), jnp.int32),
+        kept=kept,
     )
 
 
@@ -74,7 +78,8 @@ def finish(replay: Replay, done: jax.Array, length: jax.Array) -> Replay:
     """Close the episodes of (E,) `done` environments, each (E,) `length` steps long, and open new slots for them."""
     num_envs = done.shape[0]
     order = replay.count + jnp.cumsum(done, dtype=jnp.int32) - done.astype(jnp.int32)
-    ring = order % replay.capacity
+    ring = jnp.where(
+        order < replay.capacity, order, replay.kept + (order - replay.kept) % (replay.capacity - replay.kept))
     oldest = replay.finished[ring]
     fresh = jnp.where(order < replay.capacity, num_envs + order, oldest).astype(jnp.int32)
     closed = jnp.where(done, replay.open_slots, replay.length.shape[0])
@@ -105,13 +110,21 @@ def fill(replay: Replay, records: StepRecord, length: jax.Array, number: jax.Arr
     )
 
 
-def sample_episodes(replay: Replay, key: jax.Array, batch: int) -> jax.Array:
-    """(batch,) int32 slots of finished episodes, uniform with replacement whatever their length.
+def sample_episodes(replay: Replay, key: jax.Array, batch: int, share: float = 0.0) -> jax.Array:
+    """(batch,) int32 slots of finished episodes, uniform with replacement whatever their length; with a `share`, each
+    is uniform over the kept ones with that probability.
 
     The first half of the batch comes from episodes at even places of the ring and the second half from those at odd
     ones, for as long as an episode lives: two folds, so that a model fitted on one can be tried on the other.
     """
     number = jnp.minimum(replay.count, replay.capacity)
     fold = jnp.arange(batch) * 2 // batch
-    place = 2 * jax.random.randint(key, (batch,), 0, jnp.maximum((number + 1 - fold) // 2, 1)) + fold
+
+    def uniform(key: jax.Array, number: jax.Array | int) -> jax.Array:
+        return 2 * jax.random.randint(key, (batch,), 0, jnp.maximum((number + 1 - fold) // 2, 1)) + fold
+
+    place = uniform(key, number)
+    if share > 0:
+        key_which, key_kept = jax.random.split(jax.random.fold_in(key, 1))
+        place = jnp.where(jax.random.bernoulli(key_which, share, (batch,)), uniform(key_kept, replay.kept), place)
     return replay.finished[jnp.minimum(place, number - 1)]

@@ -118,6 +118,26 @@ def test_sampling_is_uniform_over_episodes_whatever_their_length():
     np.testing.assert_allclose(counts / 10_000, 1 / len(lengths), atol=4 * np.sqrt(0.25 / 10_000))
 
 
+def test_kept_episodes_stay_and_have_their_share():
+    kept = 2
+    replay = init_replay(record_of(np.zeros(NUM_ENVS, int), np.zeros(NUM_ENVS, int), np.ones(NUM_ENVS, int)),
+                         kept + NUM_ENVS + 1, HORIZON, kept)
+    seen, step = [], jax.jit(finish)
+    for _ in range(9):
+        seen.append(replay.open_slots.tolist())
+        replay = step(replay, jnp.ones(NUM_ENVS, bool), jnp.ones(NUM_ENVS, jnp.int32))
+    ring = replay.finished.tolist()
+    assert ring[:kept] == seen[0][:kept]
+    assert len(set(ring + replay.open_slots.tolist())) == len(ring) + NUM_ENVS
+    last = [slot for slots in seen for slot in slots][-(len(ring) - kept):]
+    assert sorted(ring[kept:]) == sorted(last)
+    drawn = np.asarray(jax.jit(sample_episodes, static_argnums=(2, 3))(replay, jax.random.key(0), 4000, 0.5))
+    expected = 0.5 + 0.5 * kept / len(ring)
+    np.testing.assert_allclose(np.isin(drawn, ring[:kept]).mean(), expected, atol=0.04)
+    with pytest.raises(ValueError, match="beside 9 that are kept"):
+        init_replay(jax.tree.map(lambda x: x[:, 0], replay.data), 9, HORIZON, 9)
+
+
 @pytest.mark.parametrize("steps", [1, 2, 3, 12])
 def test_the_halves_of_a_batch_come_from_two_folds_of_the_replay(steps: int):
     """Of 1, 2, 3 and 5 episodes: those at even places of the ring, and those at odd ones."""

@@ -1,0 +1,104 @@
+"""Whether an exported policy acts as the trained agent does: whole episodes of the agent, step by step."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mijax.agents.core import Agent
+from mijax.agents.dqn import DQN
+from mijax.deploy.numpy_policy import Policy, Refused
+from mijax.metrics import RunError
+from mijax.rollout import start_episodes
+from mijax.types import Params
+
+TOLERANCE = 1e-4
+"""How far actions may differ; and how much worse by the agent's own values a different discrete action may be."""
+BATCH = 10
+"""Episodes played side by side: ten of a robot's are 30 MB of frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parity:
+    """What a comparison found."""
+
+    episodes: int
+    steps: int
+    largest_difference: float
+    """Between actions; with discrete ones between the values of the two that were chosen, 0 where they are the same."""
+    ties: int
+    """Steps with another action, of a value within `TOLERANCE` of the best."""
+
+    def __str__(self) -> str:
+        found = f"{self.episodes} episodes, {self.steps} steps: "
+        return found + f"actions differ by {self.largest_difference:.2g} at most" + (
+            f", {self.ties} ties broken otherwise" if self.ties else "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """T steps of the agent, on the host."""
+
+    observation: np.ndarray  # (T, *observation_shape)
+    action: np.ndarray  # (T,) int32 or (T, A) float32
+    values: np.ndarray | None  # (T, A) with discrete actions
+
+
+def play(agent: Agent, params: Params, key: jax.Array, number: int) -> Iterator[Episode]:
+    """Greedy episodes of the agent, `BATCH` side by side."""
+    env, side_by_side = agent.env, min(number, BATCH)
+
+    @jax.jit
+    def batch(params: Params, key: jax.Array) -> tuple[Any, ...]:
+        key_start, key_steps = jax.random.split(key)
+
+        def step(carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
+            env_state, observation, memory, previous = carry
+            values = None
+            if isinstance(agent, DQN):
+                values = agent.action_values(params, memory, observation, previous)[1]
+            memory, action = agent.act(params, memory, observation, previous)
+            env_state, timestep = jax.vmap(env.step)(jax.random.split(key, side_by_side), env_state, action)
+            return (env_state, timestep.observation, memory, action), (observation, action, values, timestep.done)
+
+        start = start_episodes(env, agent, side_by_side, key_start)
+        carry = start.env_state, start.timestep.observation, start.memory, start.previous_action
+        return jax.lax.scan(step, carry, jax.random.split(key_steps, env.horizon))[1]
+
+    for begin in range(0, number, side_by_side):
+        observation, action, values, done = jax.device_get(batch(params, jax.random.fold_in(key, begin)))
+        for i in range(min(side_by_side, number - begin)):
+            ended = done[:, i]
+            length = int(np.argmax(ended)) + 1 if ended.any() else len(ended)
+            yield Episode(observation[:length, i], action[:length, i], None if values is None else values[:length, i])
+
+
+def compare(policy: Policy, agent: Agent, params: Params, key: jax.Array, number: int) -> Parity:
+    """Show the policy what the agent saw, over `number` whole episodes: its own memory, the agent's actions.
+
+    Raises:
+        RunError: an action differs by more than `TOLERANCE`, or the contract refuses what the environment shows.
+    """
+    steps, largest, ties = 0, 0.0, 0
+    for episode_number, episode in enumerate(play(agent, params, key, number)):
+        policy.reset()
+        for t, (observation, expected) in enumerate(zip(episode.observation, episode.action, strict=True)):
+            where = f"episode {episode_number}, step {t}"
+            try:
+                action = policy.act(observation, episode.action[t - 1] if t else None)
+            except Refused as error:
+                raise RunError(f"parity: {where}: the contract refuses what the environment shows: {error}") from None
+            if episode.values is None:
+                difference = float(np.max(np.abs(action - expected)))
+            else:
+                difference = float(episode.values[t, expected] - episode.values[t, action])
+                ties += int(action != expected)
+            if not difference <= TOLERANCE:
+                raise RunError(f"parity: {where}: the exported policy's action is {action}, the agent's {expected}")
+            largest = max(largest, difference)
+        steps += len(episode.action)
+    policy.reset()
+    return Parity(number, steps, largest, ties)

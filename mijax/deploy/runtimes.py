@@ -1,0 +1,57 @@
+"""Steps of exported policies in the formats that need more than NumPy: ONNX Runtime, and JAX for StableHLO."""
+
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from mijax.deploy.numpy_policy import Arrays, PolicyError, Step
+
+MISSING = "--to onnx needs onnx and onnxruntime; install them with: pip install 'mijax[deploy]'"
+
+
+def load(kind: str, path: pathlib.Path) -> Step:
+    """The step stored in `path`; `PolicyError` when it, or the package that runs it, cannot be had."""
+    return {"onnx": load_onnx, "stablehlo": load_stablehlo}[kind](path)
+
+
+def load_onnx(path: pathlib.Path) -> Step:
+    """Run by ONNX Runtime on one core: a policy is too small for several."""
+    try:
+        import onnxruntime
+    except ImportError:
+        raise PolicyError(MISSING) from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors share no base class but this one
+        raise PolicyError(f"{path}: not an ONNX model ({str(error).splitlines()[0][:200]})") from None
+    taken = {one.name for one in session.get_inputs()}
+    names = [one.name for one in session.get_outputs()]
+
+    def step(arrays: Arrays) -> dict[str, np.ndarray]:
+        results: Any = session.run(names, {name: array for name, array in arrays.items() if name in taken})
+        return dict(zip(names, results, strict=True))
+
+    return step
+
+
+def load_stablehlo(path: pathlib.Path) -> Step:
+    """Compiled by JAX for the device at hand."""
+    try:
+        import jax
+        from jax import export
+    except ImportError:
+        raise PolicyError(f"{path}: needs jax, which is not installed") from None
+    try:
+        exported = export.deserialize(bytearray(path.read_bytes()))
+    except Exception as error:  # a flatbuffer reader: whatever a damaged file makes it do
+        raise PolicyError(f"{path}: not an exported JAX program ({type(error).__name__})") from None
+    call = jax.jit(exported.call)
+
+    def step(arrays: Arrays) -> dict[str, np.ndarray]:
+        return {name: np.asarray(array) for name, array in call(dict(arrays)).items()}
+
+    return step

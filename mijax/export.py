@@ -26,7 +26,7 @@ from mijax.agents.variants import memory_of
 from mijax.config import require
 from mijax.deploy import numpy_policy, runtimes, trace
 from mijax.deploy.numpy_policy import CONTRACT_FILE, FILES, Policy, PolicyError
-from mijax.deploy.parity import Parity, compare
+from mijax.deploy.parity import Parity, compare, play
 from mijax.deploy.step import PolicyStep, contract, policy_step
 from mijax.learner import make_learner
 from mijax.metrics import RunError, RunFolder, current_versions
@@ -108,7 +108,7 @@ def write(kind: str, agent: Agent, params: Params, out: pathlib.Path, origin: di
         described = contract(agent, step) | {"format": kind, "file": FILES[kind], "sha256": digest} | origin
         _write_contract(partial, described)
         policy = Policy.load(partial)
-        found = compare(policy, agent, params, key, episodes)
+        found = compare(policy, play(agent, params, key, episodes))
         _write_contract(partial, described | {"parity": dataclasses.asdict(found)})
         if out.exists():
             shutil.rmtree(out)

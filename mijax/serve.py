@@ -12,6 +12,7 @@ a copy of it: `python serve.py --port 5555` in an exported folder.
 import argparse
 import base64
 import binascii
+import contextlib
 import itertools
 import json
 import pathlib
@@ -193,11 +194,9 @@ class Server(socketserver.ThreadingTCPServer):
         if self._room.acquire(blocking=False):
             super().process_request(request, client_address)
             return
-        try:
+        with contextlib.suppress(OSError):
             request.settimeout(1.0)
             request.sendall(b'{"error": "no more connections are accepted"}\n')
-        except OSError:
-            pass
         self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -214,10 +213,8 @@ class _Handler(socketserver.StreamRequestHandler):
 
     def handle(self) -> None:
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a client that lost power leaves
-        try:
+        with contextlib.suppress(OSError):  # the client has gone
             converse(self.server.policy, self.rfile, self.wfile)  # pyright: ignore[reportArgumentType]
-        except OSError:
-            pass  # the client has gone
 
 
 def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
@@ -250,10 +247,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with server:
         print("serving on {}:{}".format(*server.server_address[:2]), flush=True)
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever(poll_interval=0.1)
-        except KeyboardInterrupt:
-            pass
     return 0
 
 

@@ -59,6 +59,11 @@ def _logistic(x: np.ndarray) -> np.ndarray:
     return 0.5 * np.tanh(0.5 * x) + 0.5  # 1 / (1 + exp(-x)) overflows
 
 
+def _slice(start: Sequence[int], stop: Sequence[int], step: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
+    part = tuple(map(slice, start, stop, step))
+    return lambda x: x[part]
+
+
 OPERATIONS: dict[str, Callable[..., Callable[..., Any]]] = {
     **{name: lambda function=function: function for name, function in {
         "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "max": np.maximum, "min": np.minimum,
@@ -70,9 +75,9 @@ OPERATIONS: dict[str, Callable[..., Callable[..., Any]]] = {
     "reshape": lambda shape: lambda x: x.reshape(shape),
     "transpose": lambda axes: lambda x: x.transpose(axes),
     "expand": lambda shape: lambda x: np.broadcast_to(x, shape),
-    "slice": lambda start, stop, step: lambda x, at=tuple(map(slice, start, stop, step)): x[at],
+    "slice": _slice,
     "concatenate": lambda axis: lambda *parts: np.concatenate(parts, axis),
-    "cast": lambda dtype: lambda x, to=np.dtype(dtype): x.astype(to),
+    "cast": lambda dtype: lambda x: x.astype(dtype),
     "sum": lambda axes: lambda x: x.sum(axes, dtype=x.dtype),
     "greatest": lambda axes: lambda x: x.max(axes),
     "argmax": lambda axis: lambda x: x.argmax(axis).astype(np.int32),
@@ -215,6 +220,9 @@ def checked(name: str, value: Any, spec: Mapping[str, Any]) -> np.ndarray:
         raise Refused(f"{name}: its shape is {array.shape}, expected {tuple(spec['shape'])}")
     if not np.isfinite(array).all():
         raise Refused(f"{name}: holds a number that is not finite")
+    blank = spec.get("blank_channels", 0)
+    if blank and array[..., -blank:].any():
+        raise Refused(f"{name}: holds something in the last {blank} of its channels, which {('are', 'is')[blank == 1]} 0")
     dtype = np.dtype(spec["dtype"])
     whole = dtype.kind in "iu"
     if whole and (array != np.floor(array)).any():

@@ -1,11 +1,10 @@
 """Whether an exported policy acts as the trained agent does: whole episodes of the agent, step by step."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mijax.agents.core import Agent
@@ -76,17 +75,17 @@ def play(agent: Agent, params: Params, key: jax.Array, number: int) -> Iterator[
             yield Episode(observation[:length, i], action[:length, i], None if values is None else values[:length, i])
 
 
-def compare(policy: Policy, agent: Agent, params: Params, key: jax.Array, number: int) -> Parity:
-    """Show the policy what the agent saw, over `number` whole episodes: its own memory, the agent's actions.
+def compare(policy: Policy, episodes: Iterable[Episode]) -> Parity:
+    """Show the policy what the agent saw and did in whole episodes; the memory is the policy's own.
 
     Raises:
         RunError: an action differs by more than `TOLERANCE`, or the contract refuses what the environment shows.
     """
-    steps, largest, ties = 0, 0.0, 0
-    for episode_number, episode in enumerate(play(agent, params, key, number)):
+    number, steps, largest, ties = 0, 0, 0.0, 0
+    for number, episode in enumerate(episodes, start=1):
         policy.reset()
         for t, (observation, expected) in enumerate(zip(episode.observation, episode.action, strict=True)):
-            where = f"episode {episode_number}, step {t}"
+            where = f"episode {number}, step {t}"
             try:
                 action = policy.act(observation, episode.action[t - 1] if t else None)
             except Refused as error:

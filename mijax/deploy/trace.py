@@ -6,9 +6,10 @@ random numbers of a fixed seed as constants.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
@@ -137,7 +138,7 @@ class _Writer:
         values |= dict(zip(jaxpr.invars, inputs, strict=True))
 
         def read(atom: Any) -> _Value:
-            return known(atom.val, atom.aval.dtype) if isinstance(atom, core.Literal) else values[atom]
+            return known(atom.val, cast(Any, atom.aval).dtype) if isinstance(atom, core.Literal) else values[atom]
 
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
@@ -149,7 +150,8 @@ class _Writer:
         inner = parameters.get("jaxpr", parameters.get("call_jaxpr"))
         if inner is not None and name in _CALLS:
             return self.evaluate(inner, inputs)
-        if name in _RULES:
+        bitwise = name in _LOGICAL and equation.outvars[0].aval.dtype != np.bool_  # of random bits
+        if name in _RULES and not bitwise:
             results = _RULES[name](self, inputs, parameters, [variable.aval for variable in equation.outvars])
             return results if isinstance(results, list) else [results]
         if all(value.known is not None for value in inputs):
@@ -160,7 +162,7 @@ class _Writer:
 
 def known(array: Any, dtype: Any = None) -> _Value:
     """An array that does not depend on the inputs; arrays of random keys stay JAX's."""
-    if not (hasattr(array, "dtype") and jax.dtypes.issubdtype(array.dtype, jax.dtypes.extended)):
+    if not (isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jax.dtypes.extended)):
         array = np.asarray(array, dtype)
     return _Value(tuple(array.shape), array.dtype, known=array)
 
@@ -169,7 +171,12 @@ def known(array: Any, dtype: Any = None) -> _Value:
 
 _Rule = Callable[[_Writer, list[_Value], Mapping[str, Any], list[Any]], _Value | list[_Value]]
 _CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
-_SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
+_LOGICAL = ("and", "or", "not")
+
+
+def _same(writer: _Writer, inputs: list[_Value], parameters: Mapping[str, Any], out: list[Any]) -> list[_Value]:
+    del writer, parameters, out
+    return inputs
 
 
 def _wide(writer: _Writer, x: _Value, shape: Sequence[int]) -> _Value:
@@ -184,18 +191,8 @@ def _elementwise(operation: str) -> _Rule:
     return rule
 
 
-def _logical(operation: str) -> _Rule:
-    inner = _elementwise(operation)
-
-    def rule(writer: _Writer, inputs: list[_Value], parameters: Mapping[str, Any], out: list[Any]) -> Any:
-        if out[0].dtype != np.bool_ and any(x.known is None for x in inputs):
-            raise NotTraceable(f"the operation {operation!r} on {out[0].dtype}")
-        return inner(writer, inputs, parameters, out)
-
-    return rule
-
-
-def _power(writer: _Writer, inputs: list[_Value], parameters: Mapping[str, Any], _: list[Any]) -> _Value:
+def _power(writer: _Writer, inputs: list[_Value], parameters: Mapping[str, Any], out: list[Any]) -> _Value:
+    del out
     x, exponent = inputs[0], parameters["y"]
     if exponent < 1:
         raise NotTraceable(f"a power of {exponent}")
@@ -325,9 +322,9 @@ _RULES: dict[str, _Rule] = {
     **{name: _elementwise(name) for name in (
         "add", "sub", "mul", "div", "max", "min", "neg", "abs", "exp", "log", "tanh", "sqrt", "logistic", "eq", "ne",
         "lt", "le", "gt", "ge")},
-    **{name: _logical(name) for name in ("and", "or", "not")},
-    **{name: lambda writer, inputs, parameters, out: inputs for name in _SAME},
-    **{name: _reshape for name in ("reshape", "squeeze", "expand_dims")},
+    **{name: _elementwise(name) for name in _LOGICAL},
+    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "optimization_barrier"), _same),
+    **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshape),
     "integer_pow": _power, "square": _square, "rsqrt": _reciprocal_root, "select_n": _select,
     "convert_element_type": _convert, "broadcast_in_dim": _broadcast, "transpose": _transpose, "slice": _slice,
     "split": _split, "concatenate": _concatenate, "stack": _stack, "dot_general": _product,

@@ -21,7 +21,7 @@ import socket
 import socketserver
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -158,11 +158,14 @@ def numbers(name: str, nested: Any, shape: tuple[int, ...]) -> np.ndarray:
         raise Refused(f"{name}: holds a number that no float can be") from None
 
 
-def lines(stream: BinaryIO, longest: int) -> Iterator[bytes | None]:
-    """Lines of a stream without their ends; None for each that is longer, of which no more than that is ever held."""
-    while line := stream.readline(longest + 1):
+def lines(readline: Callable[[int], bytes], longest: int) -> Iterator[bytes | None]:
+    """Lines without their ends; None for each that is longer than `longest` bytes: no more of it is ever held.
+
+    `readline` returns at most so many bytes of a line, b"" at the end.
+    """
+    while line := readline(longest + 1):
         if len(line) > longest and not line.endswith(b"\n"):
-            while (rest := stream.readline(longest + 1)) and not rest.endswith(b"\n"):
+            while (rest := readline(longest + 1)) and not rest.endswith(b"\n"):
                 pass
             yield None
         else:
@@ -172,7 +175,7 @@ def lines(stream: BinaryIO, longest: int) -> Iterator[bytes | None]:
 def converse(policy: Policy, source: BinaryIO, sink: BinaryIO) -> None:
     """Answer every line of a stream until it ends."""
     conversation = Conversation(policy)
-    for line in lines(source, conversation.longest_line):
+    for line in lines(source.readline, conversation.longest_line):
         sink.write(conversation.reply(line))
         sink.flush()
 

@@ -137,6 +137,9 @@ class GridWorld(Environment):
 class ImageGridWorld(GridWorld):
     """A world seen as (rows, columns, 2) uint8: plane 0 the agent, plane 1 the goal, empty when not shown."""
 
+    interface = dataclasses.replace(
+        GridWorld.interface, observation="channel 0: 1 where the agent is; channel 1: 1 where the goal is, if shown")
+
     def __init__(self) -> None:
         super().__init__()
         assert self.tables.walls.size < 256

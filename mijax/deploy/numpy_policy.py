@@ -222,7 +222,7 @@ def checked(name: str, value: Any, spec: Mapping[str, Any]) -> np.ndarray:
         raise Refused(f"{name}: holds a number that is not finite")
     blank = spec.get("blank_channels", 0)
     if blank and array[..., -blank:].any():
-        raise Refused(f"{name}: holds something in the last {blank} of its channels, which {('are', 'is')[blank == 1]} 0")
+        raise Refused(f"{name}: holds something in the last {blank} of its channels, where only 0 belongs")
     dtype = np.dtype(spec["dtype"])
     whole = dtype.kind in "iu"
     if whole and (array != np.floor(array)).any():
@@ -275,9 +275,10 @@ def load_step(folder: pathlib.Path, contract: Mapping[str, Any]) -> Step:
 
 
 def measure(policy: Policy, seconds: float = 2.0) -> np.ndarray:
-    """(N,) seconds that single steps took, over about so many seconds, on observations of the smallest value."""
+    """(N,) seconds that single steps took, over about so many seconds, on observations of 0 or what is next to it."""
     spec = policy.contract["observation"]
-    observation = np.full(spec["shape"], spec["low"] or 0, spec["dtype"])
+    low, high = (0 if bound is None else bound for bound in (spec["low"], spec["high"]))
+    observation = np.full(spec["shape"], low if low > 0 else min(0, high), spec["dtype"])
     taken: list[float] = []
     started = time.perf_counter()
     while time.perf_counter() - started < seconds:

@@ -5,19 +5,23 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mijax.agents.core import Agent
 from mijax.agents.dqn import DQN
 from mijax.deploy.numpy_policy import Policy, Refused
 from mijax.metrics import RunError
-from mijax.rollout import start_episodes
+from mijax.rollout import select, start_episodes
 from mijax.types import Params
 
 TOLERANCE = 1e-4
 """How far actions may differ; and how much worse by the agent's own values a different discrete action may be."""
 BATCH = 10
 """Episodes played side by side: ten of a robot's are 30 MB of frames."""
+STRAY = 0.25
+"""Share of random actions in every second episode. A trained agent's own episodes are too much alike to test it: on
+Heaven-Hell there are two."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,9 +36,9 @@ class Parity:
     """Steps with another action, of a value within `TOLERANCE` of the best."""
 
     def __str__(self) -> str:
-        found = f"{self.episodes} episodes, {self.steps} steps: "
-        return found + f"actions differ by {self.largest_difference:.2g} at most" + (
-            f", {self.ties} ties broken otherwise" if self.ties else "")
+        differ = f"differ by {self.largest_difference:.2g} at most" if self.largest_difference else "are the same"
+        ties = f", {self.ties} ties broken otherwise" if self.ties else ""
+        return f"{self.episodes} episodes, {self.steps} steps: actions {differ}{ties}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,13 +46,15 @@ class Episode:
     """T steps of the agent, on the host."""
 
     observation: np.ndarray  # (T, *observation_shape)
-    action: np.ndarray  # (T,) int32 or (T, A) float32
+    action: np.ndarray  # (T,) int32 or (T, A) float32: the greedy one
+    taken: np.ndarray  # as `action`: what was done instead, in an episode that strays
     values: np.ndarray | None  # (T, A) with discrete actions
 
 
 def play(agent: Agent, params: Params, key: jax.Array, number: int) -> Iterator[Episode]:
-    """Greedy episodes of the agent, `BATCH` side by side."""
+    """Episodes of the agent, `BATCH` side by side: greedy ones, and every second one that strays."""
     env, side_by_side = agent.env, min(number, BATCH)
+    strays = jnp.arange(side_by_side) % 2 == 1
 
     @jax.jit
     def batch(params: Params, key: jax.Array) -> tuple[Any, ...]:
@@ -56,23 +62,24 @@ def play(agent: Agent, params: Params, key: jax.Array, number: int) -> Iterator[
 
         def step(carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
             env_state, observation, memory, previous = carry
-            values = None
+            seen, values = (memory, observation, previous), None
             if isinstance(agent, DQN):
-                values = agent.action_values(params, memory, observation, previous)[1]
-            memory, action = agent.act(params, memory, observation, previous)
-            env_state, timestep = jax.vmap(env.step)(jax.random.split(key, side_by_side), env_state, action)
-            return (env_state, timestep.observation, memory, action), (observation, action, values, timestep.done)
+                values = agent.action_values(params, *seen)[1]
+            memory, action = agent.act(params, *seen)
+            key_action, key_step = jax.random.split(key)
+            taken = select(strays, agent.explore(params, *seen, jnp.float32(STRAY), key_action)[1], action)
+            env_state, timestep = jax.vmap(env.step)(jax.random.split(key_step, side_by_side), env_state, taken)
+            return (env_state, timestep.observation, memory, taken), (observation, action, taken, values, timestep.done)
 
         start = start_episodes(env, agent, side_by_side, key_start)
         carry = start.env_state, start.timestep.observation, start.memory, start.previous_action
         return jax.lax.scan(step, carry, jax.random.split(key_steps, env.horizon))[1]
 
     for begin in range(0, number, side_by_side):
-        observation, action, values, done = jax.device_get(batch(params, jax.random.fold_in(key, begin)))
+        *recorded, over = jax.device_get(batch(params, jax.random.fold_in(key, begin)))
         for i in range(min(side_by_side, number - begin)):
-            ended = done[:, i]
-            length = int(np.argmax(ended)) + 1 if ended.any() else len(ended)
-            yield Episode(observation[:length, i], action[:length, i], None if values is None else values[:length, i])
+            length = int(np.argmax(over[:, i])) + 1 if over[:, i].any() else len(over)
+            yield Episode(*jax.tree.map(lambda x, i=i, length=length: x[:length, i], recorded))
 
 
 def compare(policy: Policy, episodes: Iterable[Episode]) -> Parity:
@@ -87,7 +94,7 @@ def compare(policy: Policy, episodes: Iterable[Episode]) -> Parity:
         for t, (observation, expected) in enumerate(zip(episode.observation, episode.action, strict=True)):
             where = f"episode {number}, step {t}"
             try:
-                action = policy.act(observation, episode.action[t - 1] if t else None)
+                action = policy.act(observation, episode.taken[t - 1] if t else None)
             except Refused as error:
                 raise RunError(f"parity: {where}: the contract refuses what the environment shows: {error}") from None
             if episode.values is None:

@@ -131,8 +131,7 @@ def check_free(out: pathlib.Path) -> None:
 def export(options: ExportOptions) -> pathlib.Path:
     """Export as the options say; the folder."""
     require(options.episodes >= 1, "episodes", options.episodes, "a number >= 1")
-    if options.to == "onnx":
-        _require_onnx()
+    runtimes.require(options.to, *runtimes.WRITES[options.to])
     run = RunFolder.open(options.run)
     config, present = evaluate.config_of(run), run.seeds()
     seed = options.seed if options.seed is not None else min(present, default=-1)
@@ -147,19 +146,11 @@ def export(options: ExportOptions) -> pathlib.Path:
                       "config": run.config()}, "exported_with": current_versions()}
     policy, found = write(options.to, learner.agent, state.agent.target, out, origin, evaluation_key(seed, at_step),
                           options.episodes)
-    taken = numpy_policy.measure(policy, seconds=1.0)
+    taken = numpy_policy.measure(policy, seconds=0.5)
     print(f"{config.domain}, {config.agent}, {memory_of(config)}, seed {seed}, step {at_step:,}: {out}")
     print(f"against the trained agent: {found}")
     print(f"here {1 / taken.mean():,.0f} steps per second")
     return out
-
-
-def _require_onnx() -> None:
-    try:
-        import onnx  # noqa: F401
-        import onnxruntime  # noqa: F401
-    except ImportError:
-        raise PolicyError(runtimes.MISSING) from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

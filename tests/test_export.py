@@ -292,7 +292,9 @@ def test_what_cannot_be_exported_is_named(
     (tmp_path / "mine").write_text("something")
     assert "holds something else" in failure(capsys, str(run), "--to", "npz", "--out", str(tmp_path))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    assert "pip install 'mijax[deploy]'" in failure(capsys, str(run), "--to", "onnx")
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    for kind in ("onnx", "stablehlo"):
+        assert "pip install 'mijax[deploy]'" in failure(capsys, str(run), "--to", kind)
 
 
 def test_a_policy_that_acts_otherwise_is_not_left(
@@ -311,7 +313,8 @@ def test_a_policy_that_acts_otherwise_is_not_left(
 
 
 @pytest.mark.parametrize(("name", "content"), [
-    ("policy.npz", b"PK\x03\x04 nonsense"), ("policy.json", b"{"), ("policy.json", b'{"mijax_policy": 99}')])
+    ("policy.npz", b"PK\x03\x04 nonsense"), ("policy.json", b"{"), ("policy.json", b'{"mijax_policy": 99}'),
+    ("policy.json", b'{"mijax_policy": 1, "format": "npz", "horizon": 50}')])
 def test_a_damaged_export_is_named(exported: pathlib.Path, tmp_path: pathlib.Path, name: str, content: bytes):
     for copied in ("policy.json", "policy.npz"):
         shutil.copy(exported / copied, tmp_path)

@@ -24,6 +24,8 @@ FILES = {"npz": "policy.npz", "onnx": "policy.onnx", "stablehlo": "policy.stable
 """What each format is stored in, beside the contract."""
 VERSION = 1
 """Of the contract and of the program in a policy.npz; a reader knows one."""
+NEEDED = frozenset({"horizon", "observation", "action", "previous_action", "memory", "sha256"})
+"""What a contract cannot do without."""
 NEXT = "next_"
 """Begins the name of the output that a leaf of the memory becomes."""
 SLACK = 1e-6
@@ -252,6 +254,9 @@ def read_contract(folder: pathlib.Path) -> dict[str, Any]:
         raise PolicyError(f"{path}: cannot be read ({error})") from None
     if not isinstance(contract, dict) or contract.get("mijax_policy") != VERSION or contract.get("format") not in FILES:
         raise PolicyError(f"{path}: not the contract of a policy of version {VERSION}")
+    lacking = sorted(NEEDED - set(contract))
+    if lacking:
+        raise PolicyError(f"{path}: says nothing of {lacking[0]}")
     file = folder / FILES[contract["format"]]
     try:
         digest = hashlib.sha256(file.read_bytes()).hexdigest()

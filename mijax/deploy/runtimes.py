@@ -1,5 +1,6 @@
 """Steps of exported policies in the formats that need more than NumPy: ONNX Runtime, and JAX for StableHLO."""
 
+import importlib
 import pathlib
 from typing import Any
 
@@ -7,7 +8,18 @@ import numpy as np
 
 from mijax.deploy.numpy_policy import Arrays, PolicyError, Step
 
-MISSING = "--to onnx needs onnx and onnxruntime; install them with: pip install 'mijax[deploy]'"
+WRITES = {"npz": (), "onnx": ("onnx", "onnxruntime"), "stablehlo": ("flatbuffers",)}
+"""Packages beyond the library's own that exporting a format needs."""
+
+
+def require(kind: str, *packages: str) -> None:
+    """Raise `PolicyError` unless the packages that a format needs are installed."""
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ImportError:
+            raise PolicyError(
+                f"{kind}: the package {package} is missing; install it with: pip install 'mijax[deploy]'") from None
 
 
 def load(kind: str, path: pathlib.Path) -> Step:
@@ -17,10 +29,9 @@ def load(kind: str, path: pathlib.Path) -> Step:
 
 def load_onnx(path: pathlib.Path) -> Step:
     """Run by ONNX Runtime on one core: a policy is too small for several."""
-    try:
-        import onnxruntime
-    except ImportError:
-        raise PolicyError(MISSING) from None
+    require("onnx", "onnxruntime")
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
@@ -40,11 +51,10 @@ def load_onnx(path: pathlib.Path) -> Step:
 
 def load_stablehlo(path: pathlib.Path) -> Step:
     """Compiled by JAX for the device at hand."""
-    try:
-        import jax
-        from jax import export
-    except ImportError:
-        raise PolicyError(f"{path}: needs jax, which is not installed") from None
+    require("stablehlo", "jax", "flatbuffers")
+    import jax
+    from jax import export
+
     try:
         exported = export.deserialize(bytearray(path.read_bytes()))
     except Exception as error:  # a flatbuffer reader: whatever a damaged file makes it do

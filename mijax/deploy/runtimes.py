@@ -50,7 +50,7 @@ def load_onnx(path: pathlib.Path) -> Step:
 
 
 def load_stablehlo(path: pathlib.Path) -> Step:
-    """Compiled by JAX for the device at hand."""
+    """Compiled by JAX for the device at hand, here and not in the first step, which would take seconds."""
     require("stablehlo", "jax", "flatbuffers")
     import jax
     from jax import export
@@ -59,9 +59,11 @@ def load_stablehlo(path: pathlib.Path) -> Step:
         exported = export.deserialize(bytearray(path.read_bytes()))
     except Exception as error:  # a flatbuffer reader: whatever a damaged file makes it do
         raise PolicyError(f"{path}: not an exported JAX program ({type(error).__name__})") from None
-    call = jax.jit(exported.call)
+    shapes, _ = jax.tree.unflatten(
+        exported.in_tree, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in exported.in_avals])
+    compiled = jax.jit(exported.call).lower(*shapes).compile()
 
     def step(arrays: Arrays) -> dict[str, np.ndarray]:
-        return {name: np.asarray(array) for name, array in call(dict(arrays)).items()}
+        return {name: np.asarray(array) for name, array in compiled(dict(arrays)).items()}
 
     return step

@@ -70,7 +70,7 @@ class _Writer:
     def __init__(self) -> None:
         self.code: list[Instruction] = []
         self.constants: dict[str, np.ndarray] = {}
-        self._wide: dict[str, _Value] = {}  # values that are others, expanded
+        self._expanded: dict[str, _Value] = {}  # values that are others, expanded
 
     def name_of(self, value: _Value) -> str:
         """The value's name in the program."""
@@ -101,7 +101,7 @@ class _Writer:
     def elementwise(self, operation: str, *inputs: _Value, dtype: Any = None) -> _Value:
         """An operation that broadcasts by itself: inputs that were expanded for it are used as they were."""
         shape = inputs[-1].shape
-        narrow = [self._wide.get(value.name, value) if value.known is None else value for value in inputs]
+        narrow = [self._expanded.get(value.name, value) if value.known is None else value for value in inputs]
         if np.broadcast_shapes(*(value.shape for value in narrow)) == shape:
             inputs = tuple(narrow)
         return self.emit(operation, inputs, shape, dtype)
@@ -122,7 +122,7 @@ class _Writer:
             return x
         wide = self.emit("expand", [x], shape, shape=tuple(map(int, shape)))
         if wide.known is None:
-            self._wide[wide.name] = x
+            self._expanded[wide.name] = x
         return wide
 
     def slice(self, x: _Value, start: Sequence[int], stop: Sequence[int], step: Sequence[int]) -> _Value:
@@ -150,8 +150,9 @@ class _Writer:
         inner = parameters.get("jaxpr", parameters.get("call_jaxpr"))
         if inner is not None and name in _CALLS:
             return self.evaluate(inner, inputs)
-        bitwise = name in _LOGICAL and equation.outvars[0].aval.dtype != np.bool_  # of random bits
-        if name in _RULES and not bitwise:
+        opaque = any(isinstance(value.known, jax.Array) for value in inputs)  # random keys, of which JAX alone knows
+        bitwise = name in _LOGICAL and equation.outvars[0].aval.dtype != np.bool_  # and their bits
+        if name in _RULES and not opaque and not bitwise:
             results = _RULES[name](self, inputs, parameters, [variable.aval for variable in equation.outvars])
             return results if isinstance(results, list) else [results]
         if all(value.known is not None for value in inputs):
@@ -186,6 +187,8 @@ def _wide(writer: _Writer, x: _Value, shape: Sequence[int]) -> _Value:
 
 def _elementwise(operation: str) -> _Rule:
     def rule(writer: _Writer, inputs: list[_Value], _: Mapping[str, Any], out: list[Any]) -> _Value:
+        if operation == "div" and np.dtype(out[0].dtype).kind != "f":
+            raise NotTraceable("a division of whole numbers")
         return writer.elementwise(operation, *(_wide(writer, x, out[0].shape) for x in inputs), dtype=out[0].dtype)
 
     return rule

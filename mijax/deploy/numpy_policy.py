@@ -5,8 +5,8 @@
     policy.reset()                               # at the start of every episode
     action = policy.act(observation)             # once per step
 
-`python numpy_policy.py [FOLDER]` measures its speed on this machine. This file and `mijax.serve` keep to what Python 3.10
-and NumPy 1.21 have: robots' computers are seldom the newest.
+`python numpy_policy.py [FOLDER]` measures its speed on this machine. This file and `mijax.serve` keep to what Python
+3.10 and NumPy 1.21 have: robots' computers are seldom the newest.
 """
 
 import hashlib

@@ -86,6 +86,28 @@ ActionSpec = DiscreteActions | ContinuousActions
 
 
 @dataclasses.dataclass(frozen=True)
+class Interface:
+    """What a program needs to know to stand in for the environment, a robot's above all; policies are exported with it.
+    """
+
+    observation: str = ""
+    """What an observation shows."""
+    observation_unit: str = ""
+    observation_range: tuple[float, float] | None = None
+    """Smallest and largest number that a policy may be shown; None: those of the listed observations or of the dtype,
+    and without either any finite number."""
+    action: str = ""
+    """What an action does."""
+    action_scale: tuple[float, ...] = ()
+    """What 1 means in each entry of a continuous action, in the units below."""
+    action_units: tuple[str, ...] = ()
+    frame: str = ""
+    """Which way the axes of observations and actions point."""
+    rate: float | None = None
+    """Steps per second; None: time does not matter."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Variable:
     """A ground-truth quantity that probes try to decode from learned features.
 
@@ -113,6 +135,8 @@ class Environment(abc.ABC):
     action_spec: ActionSpec
     variables: tuple[Variable, ...] = ()
     """What `ground_truth` returns, for probes; empty when nothing is declared."""
+    interface: Interface = Interface()
+    """What an exported policy's contract says of observations and actions."""
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> tuple[EnvState, TimeStep]:

@@ -64,7 +64,7 @@ class RunFolder:
             foreign = sorted({entry.name for entry in run.path.iterdir()} - started)
         if foreign:
             raise RunError(f"{path}: not empty and not a run (it holds {foreign[0]}); choose another --out")
-        _write_json(run._file("versions.json"), _versions())
+        _write_json(run._file("versions.json"), current_versions())
         _write_json(run._file("config.json"), config)
         return run
 
@@ -206,7 +206,8 @@ def _read_json(path: pathlib.Path) -> dict[str, Any]:
     return value
 
 
-def _versions() -> dict[str, Any]:
+def current_versions() -> dict[str, Any]:
+    """What works here: python, packages, platform, commit."""
     def version(package: str) -> str | None:
         try:
             return importlib.metadata.version(package)

@@ -12,7 +12,7 @@ import tyro
 
 from launch import bench, sweep
 from launch import paper as experiments
-from mijax import evaluate, report, represent, train
+from mijax import evaluate, export, report, represent, serve, train
 
 ROOT = pathlib.Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "results").rglob("*.md"))]
@@ -54,6 +54,8 @@ def options_of(kind: type, words: list[str]) -> object:
 PARSERS: dict[str, Callable[[list[str]], object]] = {
     "mijax.train": train.parse, "mijax.represent": represent.parse,
     "mijax.evaluate": functools.partial(options_of, evaluate.EvaluateOptions),
+    "mijax.export": functools.partial(options_of, export.ExportOptions),
+    "mijax.serve": serve.parse_arguments,
     "launch.sweep": sweep.parse,
     "mijax.report": functools.partial(options_of, report.ReportOptions),
     "launch.paper": experiments.parse, "launch.bench": bench.parse}

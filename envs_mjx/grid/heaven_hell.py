@@ -1,5 +1,7 @@
 """Heaven-Hell (paper Section 4.1 and Fig. 21): ask the priest which end is heaven, then go there."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +38,8 @@ class HeavenHell(GridWorld):
     name = "heaven_hell"
     observation_spec = ArraySpec((3,))
     state_spec = ArraySpec((3,))
+    interface = dataclasses.replace(
+        GridWorld.interface, observation="column / 6, row / 4, side of heaven (-1, 1; 0 away from the priest)")
     variables = (Variable("side", hidden=True, num_values=2), Variable("x", hidden=False), Variable("y", hidden=False))
     tables = _tables()
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.base import ArraySpec, DiscreteActions, Environment, TimeStep
+from envs_mjx.base import ArraySpec, DiscreteActions, Environment, Interface, TimeStep
 
 ACTIONS = DiscreteActions(4, ("right", "up", "left", "down"))
 _STEPS = ((0, 1), (-1, 0), (0, -1), (1, 0))  # (row, column) of each action
@@ -68,6 +68,7 @@ class GridWorld(Environment):
 
     horizon = 50
     action_spec = ACTIONS
+    interface = Interface(action="one cell; a move into a wall stays", frame="rows run down, columns to the right")
     tables: GridTables
 
     def __init__(self) -> None:
@@ -135,6 +136,9 @@ class GridWorld(Environment):
 
 class ImageGridWorld(GridWorld):
     """A world seen as (rows, columns, 2) uint8: plane 0 the agent, plane 1 the goal, empty when not shown."""
+
+    interface = dataclasses.replace(
+        GridWorld.interface, observation="channel 0: 1 where the agent is; channel 1: 1 where the goal is, if shown")
 
     def __init__(self) -> None:
         super().__init__()

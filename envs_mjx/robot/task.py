@@ -12,12 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, TimeStep, Variable
+from envs_mjx.base import (
+    ArraySpec,
+    ContinuousActions,
+    Demonstrations,
+    Environment,
+    Interface,
+    TimeStep,
+    Variable,
+)
 from envs_mjx.robot import depth, noise, rotation, scene
 
 OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit")
 """What `RobotState.outcome` counts."""
 RUNNING, SUCCESS, LEFT, NOT_FINITE, TIME_LIMIT = range(5)
+
+DEEPEST = float(scene.WORKSPACE_HIGH[2]) + depth.CAMERA_ABOVE_GRIPPER
+"""Metres: the depth of the table at the gripper's highest. A policy is to see no more than that, give or take three
+times the paper's noise."""
 
 
 @struct.dataclass
@@ -48,6 +60,17 @@ class RobotTask(Environment):
     action_spec = ContinuousActions(4, ("x", "y", "z", "turn"))
     observation_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32, blank=1)
     state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
+    interface = Interface(
+        observation="channel 0: depth below a camera 6 cm above the gripper, 0 where a finger is; channel 1: zeros. "
+                    "The window is 0.4 m x 0.4 m, the gripper where pixels 41 and 42 meet",
+        observation_unit="m",
+        observation_range=(-3 * noise.AMPLITUDE, DEEPEST + 3 * noise.AMPLITUDE),
+        action="the gripper's next set-point, relative to where it is",
+        action_scale=tuple(scene.ACTION_SCALE.tolist()),
+        action_units=("m", "m", "m", "rad"),
+        frame="the world's: rows run along x, columns along y, z up, whatever the gripper's yaw",
+        rate=1 / (scene.TIME_STEP * scene.SUBSTEPS),
+    )
     opening: scene.Opening
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))

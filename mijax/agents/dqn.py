@@ -73,14 +73,21 @@ class DQN(Agent):
         Returns:
             The new memory and (B,) int32 actions.
         """
-        memory, q = self._step(params, memory, observation, previous_action)
+        memory, q = self.action_values(params, memory, observation, previous_action)
         return memory, jnp.argmax(q, axis=-1).astype(jnp.int32)
+
+    def action_values(
+        self, params: Params, memory: MemoryState, observation: jax.Array, previous_action: jax.Array
+    ) -> tuple[MemoryState, jax.Array]:
+        """The new memory and (B, A) float32 Q(h, a) after one more observation; arguments as for `act`."""
+        variables = {"params": params}
+        return cast(Any, self.network.apply(variables, memory, observation, previous_action, method="step"))
 
     def value(
         self, params: Params, memory: MemoryState, observation: jax.Array, previous_action: jax.Array
     ) -> jax.Array:
         """(B,) max_a Q(h, a) after one more observation; arguments as for `act`."""
-        return jnp.max(self._step(params, memory, observation, previous_action)[1], axis=-1)
+        return jnp.max(self.action_values(params, memory, observation, previous_action)[1], axis=-1)
 
     def explore(
         self,
@@ -118,9 +125,6 @@ class DQN(Agent):
     def heads(self, agent: Params, tokens: Tokens, key: jax.Array) -> Sequence[Heads]:
         """The one memory branch's."""
         return [self._apply(self.network, agent, tokens, key)]
-
-    def _step(self, params: Params, *arguments: Any) -> tuple[MemoryState, jax.Array]:
-        return cast(Any, self.network.apply({"params": params}, *arguments, method="step"))
 
     def _td(
         self, online: Outputs, q_select: jax.Array, averaged: Outputs, bonus: jax.Array, tokens: Tokens

@@ -1,0 +1,1 @@
+"""Exported policies: what writes them, what checks them, and what runs them without the library."""

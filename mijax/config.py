@@ -214,6 +214,8 @@ class SACConfig:
     """Episodes of the environment's expert in the replay from the start, for good (paper: 80 on the robots)."""
     demonstration_share: float = 0.0
     """Probability with which an episode of a batch is drawn among the demonstrations alone (paper: 0)."""
+    imitation_weight: float = 0.0
+    """Weight of the squared distance between the actor's mean action and a demonstration's (paper: 0)."""
     rotated_copies: int = 0
     """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
     original (paper: 4 on the robots)."""
@@ -229,7 +231,7 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         _require_at_least("sac.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes")
-        _require_at_least("sac.", self, 0, "demonstrations", "rotated_copies")
+        _require_at_least("sac.", self, 0, "demonstrations", "rotated_copies", "imitation_weight")
         for name in ("learning_rate", "updates_per_step", "initial_temperature"):
             require(getattr(self, name) > 0, f"sac.{name}".replace("_", "-"), getattr(self, name), "a number > 0")
         require(self.batch_episodes % 2 == 0, "sac.batch-episodes", self.batch_episodes, "an even number")

@@ -278,6 +278,9 @@ class Learner:
     def _read(self, replay: Replay, slots: jax.Array, layout: Layout, rows: int, key: jax.Array) -> Tokens:
         """(B,) episodes in so many rows, shown again where the replay stores moments."""
         tokens = gather_rows(replay, slots, layout, rows, self.observations)
+        if self.demonstrations and self.config.sac.imitation_weight > 0:
+            expert = (slots >= self.config.num_envs) & (slots < self.config.num_envs + self.demonstrations)
+            tokens = dataclasses.replace(tokens, demonstrated=expert[jnp.maximum(tokens.segment - 1, 0)])
         copies, batch, key = self.agent.copies, slots.shape[0], jax.random.fold_in(key, 1)
         if self.moments:
             wants_state = self.agent.declaration.critic is not None

@@ -52,6 +52,7 @@ class Tokens:
     z_s: jax.Array | None  # (R, L, F) phi(s_t), or None when the agent does not use it
     states: jax.Array | None = None  # (R L, *state_shape) for asymmetric critics
     symmetry: jax.Array | None = None  # (R, L, 2) uint32, while frames are moments: see `mijax.augmentation`
+    demonstrated: jax.Array | None = None  # (R, L) bool, whether an expert acted in the episode; None: not wanted
 
     def folds(self) -> "tuple[Tokens, Tokens]":
         """The upper and the lower half of the rows: of a batch of `sample_episodes`, its two folds."""

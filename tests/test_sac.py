@@ -166,8 +166,11 @@ def drawn_by_hand(mean: Any, log_scale: Any, noise: Any) -> tuple[np.ndarray, np
 
 @pytest.mark.parametrize(("name", "bootstrap", "trace_decay"), [("base", False, 0.0), ("mi", True, 0.7)])
 def test_losses_by_hand(name: str, bootstrap: bool, trace_decay: float):
-    options = dataclasses.replace(CONFIG.sac, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay)
+    options = dataclasses.replace(
+        CONFIG.sac, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay, imitation_weight=0.7)
     case = Case(name, sac=options)
+    if name == "base":  # the first and the last episode are an expert's
+        case.tokens = dataclasses.replace(case.tokens, demonstrated=case.tokens.segment != 2)
     tokens, params, agent = jax.device_get(case.tokens), case.state.params, case.state.params["agent"]
     _, _, key_action, key_next = jax.random.split(jax.random.key(0), 4)
     taken = np.roll(tokens.previous_action, -1, axis=1)
@@ -209,7 +212,13 @@ def test_losses_by_hand(name: str, bootstrap: bool, trace_decay: float):
     expected |= {"loss/td": np.mean(errors), "loss/actor": np.mean(advantages), "actor/entropy": np.mean(entropies)}
     for part, value in expected.items():
         assert metrics[part] == pytest.approx(value, rel=2e-3, abs=1e-5), part
-    total = expected["loss/td"] + expected["loss/actor"] + np.log(0.3) * (np.mean(entropies) + ACTIONS)
+    if name == "base":
+        moves = np.concatenate([np.tanh(mean)[row, first : end - 1] - taken[row, first : end - 1]
+                                for row, first, end in (SPANS[0], SPANS[2])])
+        expected["loss/imitation"] = np.mean(np.sum(np.square(moves), axis=-1))
+        assert metrics["loss/imitation"] == pytest.approx(expected["loss/imitation"], rel=2e-3)
+    total = 0.7 * expected.get("loss/imitation", 0.0) + expected["loss/td"] + expected["loss/actor"]
+    total += np.log(0.3) * (np.mean(entropies) + ACTIONS)
     if name == "mi":  # the auxiliary loss of both branches
         total += expected["loss/f"] + 0.25 * 2 * expected["loss/auxiliary"]
     assert loss == pytest.approx(total, rel=2e-3)

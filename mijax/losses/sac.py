@@ -84,6 +84,12 @@ def actor_loss(log_prob: jax.Array, q: jax.Array, temperature: jax.Array, mask: 
     return masked_mean(jax.lax.stop_gradient(temperature) * log_prob - jnp.min(q, axis=0), mask)
 
 
+def imitation_loss(action: jax.Array, demonstrated: jax.Array, mask: jax.Array) -> jax.Array:
+    """E[ |a - a*|^2 ] over the transitions of demonstrations: (..., A), (..., A), (...) bool -> (). Not the paper's."""
+    chex.assert_equal_shape([action, demonstrated])
+    return masked_mean(jnp.sum(jnp.square(action - demonstrated), axis=-1), mask)
+
+
 def temperature_loss(
     log_temperature: jax.Array, log_prob: jax.Array, target_entropy: float, mask: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:

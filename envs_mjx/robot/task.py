@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 
 from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, TimeStep, Variable
-from envs_mjx.robot import depth, noise, rotation, scene
+from envs_mjx.robot import depth, noise, rotation, scene, window
 
 OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit")
 """What `RobotState.outcome` counts."""
@@ -48,7 +48,7 @@ class RobotTask(Environment):
     action_spec = ContinuousActions(4, ("x", "y", "z", "turn"))
     observation_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32, blank=1)
     state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
-    opening: scene.Opening
+    opening: window.Opening
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 

@@ -127,8 +127,8 @@ def close(height: Array) -> Array:
 def fill(height: Array) -> Array:
     """`height` (rows, columns), its cells without a value (`NOTHING`) filled from the nearest ones along the axes.
 
-    Of the four, the nearest counts, and of equally near ones the lower: what is hidden lies behind something high. A
-    map without any value becomes a table at 0.
+    Of the four, the nearest counts, and of equally near ones the lower: what is hidden lies behind something high.
+    Where neither row nor column has a value the table is taken to be, at 0.
     """
     xp = namespace(height)
     best, nearest = xp.zeros_like(height), xp.full(height.shape, np.inf, height.dtype)
@@ -148,8 +148,8 @@ def _last_value(height: Array, axis: int, forth: bool) -> tuple[Array, Array]:
     along = along if forth else along[::-1]
     index = xp.arange(along.shape[0], dtype=np.int32)[:, None]
     last = _running_maximum(xp.where(along > window.NOTHING, index, -1))
-    value = xp.take_along_axis(along, xp.maximum(last, 0), axis=0)
-    distance = xp.where(last >= 0, index - last, np.inf).astype(height.dtype)
+    value = xp.where(last >= 0, xp.take_along_axis(along, xp.maximum(last, 0), axis=0), np.inf)
+    distance = xp.where(last >= 0, (index - last).astype(height.dtype), np.inf)
     value, distance = (x if forth else x[::-1] for x in (value, distance))
     return (value, distance) if axis == 0 else (value.T, distance.T)
 

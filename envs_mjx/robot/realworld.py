@@ -103,32 +103,47 @@ class RealWorld(Environment):
         self.rig.close()
 
     def reset(self, key: jax.Array, movable: int | None = None) -> tuple[RealState, TimeStep]:
-        """Draw a scene as training does, and a world.
+        """Draw a scene as training does, and a world; see `begin`."""
+        state = self.begin(key, movable)
+        return state, self.show(state)
+
+    def step(self, key: jax.Array, env_state: RealState, action: np.ndarray) -> tuple[RealState, TimeStep]:
+        """Move the gripper, then look; see `advance`."""
+        state = self.advance(key, env_state, action)
+        return state, self.show(state)
+
+    def begin(self, key: jax.Array, movable: int | None = None) -> RealState:
+        """What `reset` does, without a look.
 
         Args:
             key: draws all, in the same way whichever object is movable.
             movable: 0 or 1 makes that object the movable one; None draws it.
         """
-        key_scene, key_world, key_image = jax.random.split(key, 3)
+        key_scene, key_world = jax.random.split(key)
         robot: RobotState = jax.device_get(self._draw_scene(key_scene))
         if movable is not None:
             joints = np.asarray(self.training.joints(robot.poses[movable]))
             robot = dataclasses.replace(
                 robot, movable=np.int32(movable), qpos=np.concatenate([robot.qpos[:4], joints]))
+        return self.set_up(robot, key_world)
+
+    def set_up(self, robot: RobotState, key: jax.Array) -> RealState:
+        """A moment of training in this world, at rest; `key` draws the world and the cameras' noise."""
+        key_world, key_image = jax.random.split(key)
         draw = self._world(np.random.default_rng(np.asarray(jax.random.key_data(key_world))))
         self._furnish(robot, draw)
         mujoco.mj_resetData(self.model, self.data)  # pyright: ignore[reportAttributeAccessIssue]
         self._place(robot)
-        state = RealState(
+        return RealState(
             robot=robot, seen=robot, physics=self._physics(), draw=draw, first_touched=NOTHING_TOUCHED, pressed=0.0,
             outcome=RUNNING, image_key=key_image)
-        return state, self.show(state)
 
-    def step(self, key: jax.Array, env_state: RealState, action: np.ndarray) -> tuple[RealState, TimeStep]:
-        """Move the gripper for half a second, or until the task is solved or the robot stops itself."""
+    def advance(self, key: jax.Array, env_state: RealState, action: np.ndarray) -> RealState:
+        """What `step` does, without a look: half a second, or until the task is solved or the robot stops itself."""
         self._resume(env_state)
         start = self.data.qpos[:4].copy()
-        target = np.asarray(target_of(jnp.asarray(start, jnp.float32), jnp.nan_to_num(jnp.asarray(action, jnp.float32))))
+        wanted = np.nan_to_num(np.asarray(action, np.float32))
+        target = np.asarray(target_of(jnp.asarray(start, jnp.float32), jnp.asarray(wanted)))
         robot, seen, outcome = env_state.robot, None, RUNNING
         pressed, touched = env_state.pressed, env_state.first_touched
         for tick in range(1, _TICKS + 1):
@@ -151,10 +166,9 @@ class RealWorld(Environment):
             outcome = TIME_LIMIT
         robot = dataclasses.replace(robot, time=np.int32(time), touched=np.bool_(touched != NOTHING_TOUCHED),
                                     outcome=np.int32(min(outcome, STOPPED - 1)))
-        state = RealState(
+        return RealState(
             robot=robot, seen=robot if seen is None else seen, physics=self._physics(), draw=env_state.draw,
             first_touched=touched, pressed=pressed, outcome=outcome, image_key=key)
-        return state, self.show(state)
 
     def show(self, env_state: RealState) -> TimeStep:
         """What the cameras make of a moment, fused; the state is zeros."""

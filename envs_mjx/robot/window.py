@@ -43,6 +43,7 @@ OPEN = Opening(0.052, 29.0)
 HALF_OPEN = Opening(0.036, 14.0)
 CLOSED = Opening(0.015, 0.0)
 """Narrower than the original's, whose bar of 80 mm would sit on a handle's side bars, which leave 60 mm."""
+OPENINGS = {"block_pulling": OPEN, "block_pushing": HALF_OPEN, "drawer_opening": CLOSED}
 
 
 def namespace(*arrays: Array) -> Any:

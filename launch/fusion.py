@@ -1,8 +1,9 @@
-"""`python -m launch.fusion`: how far depth fused from exact cameras is from the analytic depth of training."""
+"""`python -m launch.fusion`: how far depth fused from three cameras is from the analytic depth of training."""
 
 import contextlib
 import dataclasses
 import sys
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,8 @@ class FusionOptions:
 
     scenes: int = 200
     """Per task."""
+    gap: Literal["none", "mild", "hard"] = "none"
+    """What the cameras are like: none is exact (envs_mjx/robot/gap.py)."""
 
 
 def moments(training: RobotTask, key: jax.Array, number: int) -> list[RobotState]:
@@ -62,12 +65,13 @@ def main() -> int:
     if headless.bind() is None:
         print("error: no OpenGL without a display: the cameras need EGL or OSMesa", file=sys.stderr)
         return 1
+    print(f"{options.scenes} scenes of each task, gap {options.gap}")
     print(f"{'task':<16}{'gripper':<14}{'median mm':>10}{'<= 5 mm':>9}{'worst scene':>12}")
     for domain in configs.ROBOTS:
         training = registry.make(domain)
         assert isinstance(training, RobotTask)
         robots = moments(training, jax.random.key(0), options.scenes)
-        with contextlib.closing(RealWorld(training, GAPS["none"])) as world:
+        with contextlib.closing(RealWorld(training, GAPS[options.gap])) as world:
             for gripper in (False, True):
                 error = errors(world, robots, gripper)
                 near = (error <= 0.005).mean(axis=(1, 2))

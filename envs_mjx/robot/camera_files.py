@@ -1,7 +1,7 @@
 """What cameras' drivers record, read: depth images, point clouds, and the calibration that goes with them.
 
-    python -m envs_mjx.robot.camera_files left.png right.png overhead.npz --calibration cameras.json \\
-        --domain block_pulling --gripper 0.5 0 0.2 0 --out observation
+    python -m envs_mjx.robot.camera_files left.png right.npz --calibration cameras.json --domain block_pulling \\
+        --gripper 0.5 0 0.2 0
 
 makes the observation of one moment, as observation.npz and as a picture. A file belongs to the camera that it is named
 after. This module needs NumPy and Pillow, neither JAX nor MuJoCo.
@@ -164,8 +164,8 @@ def _is_rigid(pose: np.ndarray) -> bool:
             and bool(np.allclose(pose[3], [0, 0, 0, 1])))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command's options."""
     parser = argparse.ArgumentParser(prog="python -m envs_mjx.robot.camera_files",
                                      description="The observation of one moment from recorded files.")
     parser.add_argument("files", nargs="+", type=pathlib.Path, help="depth images (.png, .npz) and clouds (.ply)")
@@ -175,7 +175,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                         help="pose of the end effector in the robot's frame, metres and radians")
     parser.add_argument("--pad", nargs=2, type=float, metavar=("X", "Y"), help="middle of the goal pad, metres")
     parser.add_argument("--out", default="observation", type=pathlib.Path, help="name of the .npz and the .png")
-    options = parser.parse_args(arguments)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    options = parse(arguments)
     try:
         if (options.pad is not None) != (options.domain == "block_pushing"):
             raise CameraFileError("--pad: accepted with --domain block_pushing, and needed there")

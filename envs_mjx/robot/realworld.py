@@ -35,7 +35,8 @@ STOPPED = len(task.OUTCOMES)
 NOTHING_TOUCHED, IMMOVABLE, MOVABLE = -1, 0, 1
 """What `RealState.first_touched` counts."""
 STOP_FORCE = 50.0
-"""Newtons, pressing down: 5 mm too deep at the stiffness of `tabletop`. Expert episodes stay below 15 N (measured)."""
+"""Newtons, pressing down: 5 mm too deep at the stiffness of `tabletop`. In 150 expert
+episodes of each task, whatever the gap, it never was above 17 N (measured)."""
 _TICK = 0.02  # s, between two readings of the force, two set-points and two tests of success
 _TICKS, _RAMP_TICKS = 25, 15
 _SUBSTEPS = round(_TICK / tabletop.TIME_STEP)
@@ -92,6 +93,7 @@ class RealWorld(Environment):
         self._finger = self._geoms_of("gripper")
         self._loose = self._geoms_of("loose", "loose_drawer")
         self._fixed = self._geoms_of("fixed", "fixed_drawer")
+        self._movable = np.unique(self.model.geom_bodyid[self._loose])
         self._draw_scene = jax.jit(lambda key: training.reset(key)[0])
         self._conditions = jax.jit(lambda moment: (training.solved(moment), training.left_workspace(moment)))
         pad = training.name == "block_pushing"
@@ -219,11 +221,8 @@ class RealWorld(Environment):
             model.body_quat[body] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
         if self.training.name == "block_pushing":
             model.body_pos[model.body("pad").id] = *robot.goal, 0
-        for name in ("loose", "loose_drawer"):
-            if name in (model.body(body).name for body in range(model.nbody)):
-                body = model.body(name).id
-                model.body_mass[body] = nominal.body_mass[body] * draw.mass
-                model.body_inertia[body] = nominal.body_inertia[body] * draw.mass
+        model.body_mass[self._movable] = nominal.body_mass[self._movable] * draw.mass
+        model.body_inertia[self._movable] = nominal.body_inertia[self._movable] * draw.mass
         model.geom_friction[self._finger, 0] = nominal.geom_friction[self._finger, 0] * draw.finger_friction
         table = model.geom("table").id
         model.geom_friction[table, 0] = nominal.geom_friction[table, 0] * draw.slide_friction

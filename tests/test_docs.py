@@ -10,9 +10,10 @@ from collections.abc import Callable
 import pytest
 import tyro
 
-from launch import bench, sweep
+from envs_mjx.robot import camera_files
+from launch import bench, fusion, sweep
 from launch import paper as experiments
-from mijax import evaluate, export, report, represent, serve, train
+from mijax import evaluate, export, report, represent, serve, train, transfer
 
 ROOT = pathlib.Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "results").rglob("*.md"))]
@@ -58,6 +59,9 @@ PARSERS: dict[str, Callable[[list[str]], object]] = {
     "mijax.serve": serve.parse_arguments,
     "launch.sweep": sweep.parse,
     "mijax.report": functools.partial(options_of, report.ReportOptions),
+    "mijax.transfer": functools.partial(options_of, transfer.TransferOptions),
+    "launch.fusion": functools.partial(options_of, fusion.FusionOptions),
+    "envs_mjx.robot.camera_files": camera_files.parse,
     "launch.paper": experiments.parse, "launch.bench": bench.parse}
 
 

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from envs_mjx.robot import scene
+from envs_mjx.robot import scene, window
 from envs_mjx.robot.blocks import Block, BlockTask, square_gap
 from envs_mjx.robot.task import RobotState
 
@@ -20,7 +20,7 @@ class BlockPulling(BlockTask):
     """
 
     name = "block_pulling"
-    opening = scene.OPEN
+    opening = window.OPEN
     block = Block(side=0.10, height=0.05, mass=0.5, friction=0.5)
     reach = 0.0
     blocks_collide = False  # the episode ends when they touch

@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from envs_mjx.robot import depth, scene
+from envs_mjx.robot import depth, scene, window
 from envs_mjx.robot.blocks import Block, BlockTask
 from envs_mjx.robot.task import RobotState, first_valid
+from envs_mjx.robot.window import PAD_DEPTH, PAD_SIDE
 
-PAD_SIDE, PAD_DEPTH = 0.09, 0.02
 _ON_PAD = 0.05
 _CUBES, _PADS = 0.14, 0.135  # half-widths of the areas of their middles
 _APART, _FROM_PAD = 0.12, 0.09
@@ -26,7 +26,7 @@ class BlockPushing(BlockTask):
     """
 
     name = "block_pushing"
-    opening = scene.HALF_OPEN
+    opening = window.HALF_OPEN
     block = Block(side=0.05, height=0.05, mass=0.02, friction=1.0)
     reach = 0.05
     blocks_collide = True

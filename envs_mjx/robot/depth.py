@@ -1,22 +1,17 @@
 """The orthographic top-down depth image, exactly: analytic heights of upright boxes, a tray and horizontal capsules.
 
-The image is 84 x 84, its window 0.4 x 0.4 m. Rows run along world x, columns along world y, whatever the gripper's yaw.
-The gripper stands at the point where pixels 41 and 42 meet, so that turning an image about its middle turns the scene
-about the gripper. Lengths are in metres, angles in radians.
+`envs_mjx.robot.window` tells what an image shows. The gripper stands in its middle, so that turning an image turns the
+scene about the gripper. Lengths are in metres, angles in radians.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-SIZE = 84
-WINDOW = 0.4
-PIXEL = WINDOW / SIZE
-CAMERA_ABOVE_GRIPPER = 0.06
-NOTHING = -1.0
-"""Height of what is not there: below everything that is."""
-_FINGER_HALF = 3.0  # pixels
-_OFFSETS = (np.arange(SIZE, dtype=np.float32) - np.float32(SIZE / 2 - 0.5))  # pixels from the middle
+from envs_mjx.robot.window import CAMERA_ABOVE_GRIPPER, NOTHING, OFFSETS, PIXEL, SIZE, WINDOW, depth, fingers
+
+__all__ = ["CAMERA_ABOVE_GRIPPER", "NOTHING", "PIXEL", "SIZE", "WINDOW", "box", "capsule", "depth", "fingers",
+           "local_frame", "tray"]
 
 
 def local_frame(gripper_xy: jax.Array, pose: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -26,8 +21,8 @@ def local_frame(gripper_xy: jax.Array, pose: jax.Array) -> tuple[jax.Array, jax.
         u, v: both (84, 84), coordinates along the body's own x and y axes.
     """
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    x = (_OFFSETS * np.float32(PIXEL))[:, None] + (gripper_xy[0] - pose[0])
-    y = (_OFFSETS * np.float32(PIXEL))[None, :] + (gripper_xy[1] - pose[1])
+    x = (OFFSETS * np.float32(PIXEL))[:, None] + (gripper_xy[0] - pose[0])
+    y = (OFFSETS * np.float32(PIXEL))[None, :] + (gripper_xy[1] - pose[1])
     return cos * x + sin * y, cos * y - sin * x
 
 
@@ -47,18 +42,3 @@ def capsule(along: jax.Array, across: jax.Array, half_length: float, radius: flo
     beyond = jnp.maximum(jnp.abs(along) - half_length, 0.0)
     rise = radius * radius - across * across - beyond * beyond
     return jnp.where(rise >= 0, axis_height + jnp.sqrt(jnp.maximum(rise, 0.0)), NOTHING)
-
-
-def fingers(yaw: jax.Array, offset: float) -> jax.Array:
-    """(84, 84) bool: two squares of 6 x 6 pixels, `offset` pixels from the middle to both sides along the yaw ()."""
-    def beside(centre: jax.Array) -> jax.Array:
-        distance = jnp.asarray(_OFFSETS) - centre
-        return (distance > -_FINGER_HALF) & (distance <= _FINGER_HALF)
-
-    row, column = offset * jnp.cos(yaw), offset * jnp.sin(yaw)
-    return (beside(row)[:, None] & beside(column)[None, :]) | (beside(-row)[:, None] & beside(-column)[None, :])
-
-
-def depth(height: jax.Array, gripper_z: jax.Array, painted: jax.Array) -> jax.Array:
-    """(84, 84) metres below a camera 6 cm above the gripper, at least 0; 0 where a finger is `painted` (84, 84)."""
-    return jnp.where(painted, 0.0, jnp.maximum(gripper_z + CAMERA_ABOVE_GRIPPER - height, 0.0))

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from envs_mjx.robot import depth, scene
+from envs_mjx.robot import depth, scene, window
 from envs_mjx.robot.task import RobotState, RobotTask, first_valid, turn_common
 
 CABINET = (0.1065, 0.114, 0.054)  # depth, width, height
@@ -32,7 +32,7 @@ class DrawerOpening(RobotTask):
     """
 
     name = "drawer_opening"
-    opening = scene.CLOSED
+    opening = window.CLOSED
     placed = ("loose", "fixed")
 
     def xml(self, visual: bool = False) -> str:

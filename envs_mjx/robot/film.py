@@ -11,14 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from envs_mjx.robot.headless import BACKENDS
 from envs_mjx.robot.task import OUTCOMES, RobotState, RobotTask
 
 SIDE = 252  # pixels of a panel, three for each pixel of an image
 _CAPTION, _GAP = 22, 4  # pixels
 _FARTHEST = 0.31  # metres: the largest depth there is
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)
-BACKENDS = ("egl", "osmesa")
-"""OpenGL without a display, in the order in which they are tried; MUJOCO_GL names another one."""
 
 _RENDER = """
 import pickle, sys
@@ -45,11 +44,11 @@ def frames(env: RobotTask, states: Sequence[RobotState], pictures: np.ndarray | 
     film = []
     for number, env_state in enumerate(states):
         observation, state = map(np.asarray, env.render(env_state))
-        panels = {"depth (observation)": _grey(observation[..., 0]),
-                  "without the immovable (state)": _grey(state[..., 1])}
+        panels = {"depth (observation)": grey(observation[..., 0]),
+                  "without the immovable (state)": grey(state[..., 1])}
         if pictures is not None:
             panels["rendered; red moves"] = pictures[number]
-        film.append(_side_by_side(panels, f"step {int(env_state.time)}  {OUTCOMES[int(env_state.outcome)]}"))
+        film.append(side_by_side(panels, f"step {int(env_state.time)}  {OUTCOMES[int(env_state.outcome)]}"))
     return film
 
 
@@ -72,14 +71,15 @@ def rendered(env: RobotTask, states: Sequence[RobotState], size: int = SIDE) -> 
     return None
 
 
-def _grey(depth: np.ndarray) -> np.ndarray:
+def grey(depth: np.ndarray) -> np.ndarray:
     """(SIDE, SIDE, 3) uint8 of (84, 84) metres: near is bright."""
     grey = np.round(255 * (1 - np.clip(depth / _FARTHEST, 0, 1))).astype(np.uint8)
     factor = SIDE // depth.shape[0]
     return np.repeat(np.repeat(grey, factor, axis=0), factor, axis=1)[..., None].repeat(3, axis=2)
 
 
-def _side_by_side(panels: dict[str, np.ndarray], caption: str) -> np.ndarray:
+def side_by_side(panels: dict[str, np.ndarray], caption: str) -> np.ndarray:
+    """(height, width, 3) uint8: panels (SIDE, SIDE, 3) with their titles, and a caption below them."""
     width = len(panels) * (SIDE + _GAP) - _GAP
     image = Image.new("RGB", (width, SIDE + 2 * _CAPTION), _PAPER)
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(size=12)

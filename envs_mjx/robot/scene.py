@@ -6,7 +6,6 @@ in radians; a pose (3,) is x, y, yaw.
 """
 
 import contextlib
-import dataclasses
 import io
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -15,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+
+from envs_mjx.robot.window import FINGER_BELOW, FINGER_RADIUS
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional package warp is missing
     from mujoco import mjx
@@ -27,7 +28,6 @@ START = np.array([0.5, 0.0, 0.2, 0.0], np.float32)
 """x, y, z, yaw of the gripper after a reset."""
 ACTION_SCALE = np.array([0.05, 0.05, 0.05, np.pi / 8], np.float32)
 """What an action of 1 asks for: metres and radians."""
-FINGER_RADIUS = 0.0125
 GRAVITY = 9.81
 FINGER_FRICTION = 0.8
 
@@ -35,7 +35,6 @@ TIME_STEP = 0.02
 SUBSTEPS = 10
 RAMP_SUBSTEPS = 6
 """The set-point moves evenly over these substeps; the others let the gripper arrive (a test allows 2.5 mm)."""
-_FINGER_BELOW = 0.005  # the end effector is this far above the fingers' lowest points
 _STIFFNESS, _FORCE = 2500.0, 30.0  # N/m on 1 kg, critically damped; N
 _TURN_STIFFNESS, _TORQUE = 12.5, 3.0  # Nm/rad on 0.005 kg m^2, critically damped; Nm
 _CONTACT = 'solref="0.04 1"'  # the shortest time constant that this time step allows
@@ -47,7 +46,7 @@ def gripper_xml(offset: float, capsules: bool) -> str:
     A finger is a sphere at its tip, which is all that meets boxes from the side or from above: they are upright, and
     higher than the tips when these are low. `capsules` adds vertical capsules, to hook lying bars.
     """
-    tip = FINGER_RADIUS - _FINGER_BELOW
+    tip = FINGER_RADIUS - FINGER_BELOW
     geoms = []
     for index, x in enumerate((-offset, offset)):
         geoms.append(f'<geom name="tip{index}" type="sphere" size="{FINGER_RADIUS}" pos="{x} 0 {tip}"/>')
@@ -180,19 +179,3 @@ def target_of(qpos: jax.Array, action: jax.Array) -> jax.Array:
     """(4,) where an action in [-1, 1]^4 sends the gripper: from where it is, no further than the workspace."""
     target = qpos[:4] + jnp.clip(action, -1.0, 1.0) * ACTION_SCALE
     return jnp.concatenate([jnp.clip(target[:3], WORKSPACE_LOW, WORKSPACE_HIGH), target[3:]])
-
-
-@dataclasses.dataclass(frozen=True)
-class Opening:
-    """How far the gripper is open, for a whole task."""
-
-    finger: float
-    """Metres from the middle to the centre of each finger."""
-    painted: float
-    """Pixels from the middle to each painted finger."""
-
-
-OPEN = Opening(0.052, 29.0)
-HALF_OPEN = Opening(0.036, 14.0)
-CLOSED = Opening(0.015, 0.0)
-"""Narrower than the original's, whose bar of 80 mm would sit on a handle's side bars, which leave 60 mm."""

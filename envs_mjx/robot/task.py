@@ -21,7 +21,7 @@ from envs_mjx.base import (
     TimeStep,
     Variable,
 )
-from envs_mjx.robot import depth, noise, rotation, scene
+from envs_mjx.robot import depth, noise, rotation, scene, window
 
 OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit")
 """What `RobotState.outcome` counts."""
@@ -71,7 +71,7 @@ class RobotTask(Environment):
         frame="the world's: rows run along x, columns along y, z up, whatever the gripper's yaw",
         rate=1 / (scene.TIME_STEP * scene.SUBSTEPS),
     )
-    opening: scene.Opening
+    opening: window.Opening
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 

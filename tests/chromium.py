@@ -113,8 +113,9 @@ class Chromium:
     def point(self, selector: str, across: float, down: float, click: bool = False) -> None:
         """Move the mouse over an element, to fractions of its width and height, and click there."""
         left, top, width, height = self.evaluate(
-            f"(() => {{ const element = document.querySelector({selector!r});"
-            "element.scrollIntoView({block: 'center'}); const box = element.getBoundingClientRect(); return [box.left, box.top, box.width, box.height]; })()")
+            f"(() => {{ const element = document.querySelector({selector!r}); element.scrollIntoView("
+            "{block: 'center'}); const box = element.getBoundingClientRect();"
+            "return [box.left, box.top, box.width, box.height]; })()")
         place = {"x": left + across * width, "y": top + down * height}
         self.call("Input.dispatchMouseEvent", type="mouseMoved", **place)
         if click:

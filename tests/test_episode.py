@@ -6,12 +6,13 @@ import pathlib
 import jax
 import numpy as np
 import pytest
+from compass import Compass
 from PIL import Image
 
 from envs_mjx import registry
-from mijax import report
+from mijax import page, report
 from mijax.checkpoint import Checkpoints
-from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig, Stage1Config
+from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig, SACConfig, Stage1Config
 from mijax.episode import Trace, trace
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.metrics import RunFolder
@@ -111,6 +112,35 @@ def test_the_command_draws_an_episode_of_each_kind(
     colours = {colour for count, colour in image.getcolors(image.width * image.height) or [] if count > 30}
     assert ((214, 39, 40) in colours) is (agent == "mi")  # the red ring
     assert (96, 186, 110) in colours  # the goal's cell
+    run.append(2, {"step": 200, "evaluation/success": 0.5})
+    assert report.main([str(run.path), "--html"]) == 0
+    shown = page.read_data(run.path / page.FILE)["runs"][0]["episodes"]
+    assert (shown["seed"], shown["step"], len(shown["episodes"])) == (2, 200, report.EPISODES)
+    for one in shown["episodes"]:
+        values = np.array(one["q"])[:-1]
+        np.testing.assert_array_equal(values.argmax(1), one["action"][:-1])
+        assert (one["explained"] is None) is (agent == "base")
+        assert (one["attention"] is None) is (memory == "gru")
+
+
+def test_continuous_actions_are_traced() -> None:
+    stage1 = dataclasses.replace(STAGE1, batch_size=50)
+    config = dataclasses.replace(
+        CONFIG, stage1=stage1, sac=SACConfig(batch_episodes=4, warmup_episodes=4, replay_steps=400))
+    learner = make_learner(Compass(), config)
+    representation, _ = learn_representation(learner.env, stage1, jax.random.key(0))
+    seen = trace(learner, jax.jit(learner.init)(training_key(0), representation), jax.random.key(3), 6)
+    assert seen.action.shape == (6, 5, 2)
+    assert seen.q.shape == (6, 5, 1)
+    assert np.isfinite(seen.q).all()
+    assert seen.length.tolist() == [Compass.choice + 1] * 6
+    assert seen.bonus is not None
+    assert seen.attention is not None
+    np.testing.assert_allclose(seen.attention[:, :, :4].sum(-1), 1, atol=1e-5)
+    # the action that was taken is the one that leads to the next observation
+    pointed = np.sum(seen.action[:, Compass.choice] * seen.state[:, 0, :2], axis=-1)
+    norm = np.linalg.norm(seen.action[:, Compass.choice], axis=-1)
+    np.testing.assert_array_equal(seen.reward[:, Compass.choice + 1] > 0, pointed > 0.7071 * norm)
 
 
 def test_what_cannot_be_drawn_is_named(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:

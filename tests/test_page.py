@@ -3,11 +3,9 @@
 import base64
 import csv
 import io
-import json
 import pathlib
 import re
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
@@ -86,16 +84,9 @@ def written(runs: list[ReportedRun], played: episodes.Episodes, tmp_path_factory
     return path
 
 
-def data_of(path: pathlib.Path) -> dict[str, Any]:
-    """What a browser reads of a page."""
-    blob = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(), re.DOTALL)
-    assert blob is not None
-    return json.loads(blob.group(1))
-
-
 def test_the_data_are_the_tables(runs: list[ReportedRun], written: pathlib.Path, tmp_path: pathlib.Path) -> None:
     report.write_report(runs, tmp_path)
-    data = data_of(written)
+    data = page.read_data(written)
     for name in ("runs", "seeds"):
         with (tmp_path / f"{name}.csv").open(newline="") as file:
             lines = list(csv.DictReader(file))
@@ -106,7 +97,7 @@ def test_the_data_are_the_tables(runs: list[ReportedRun], written: pathlib.Path,
 
 
 def test_the_curves_are_those_of_the_seeds(runs: list[ReportedRun], written: pathlib.Path) -> None:
-    curves = data_of(written)["runs"][0]["curves"]
+    curves = page.read_data(written)["runs"][0]["curves"]
     assert list(curves) == ["evaluation/success", "evaluation/return", "evaluation/length", "loss/td"]
     success = curves["evaluation/success"]
     assert success["steps"] == list(range(1000, 11_000, 1000))
@@ -135,7 +126,7 @@ def test_published_results_are_read(tmp_path: pathlib.Path) -> None:
 
 
 def test_options_tell_what_differs(written: pathlib.Path) -> None:
-    options = {line["name"]: line for line in data_of(written)["options"]}
+    options = {line["name"]: line for line in page.read_data(written)["options"]}
     assert options["agent"] == {"name": "agent", "values": ["mi", "base"], "differs": True}
     assert options["dqn.discount"] == {"name": "dqn.discount", "values": ["0.97", "0.97"], "differs": False}
     assert not options["versions.python"]["differs"]
@@ -153,7 +144,7 @@ def test_a_label_cannot_end_the_data(tmp_path: pathlib.Path) -> None:
     label = "</script><img src=x>"
     page.write_page(results.load([run.path], [label]), tmp_path / "page.html", [None])
     assert label not in (tmp_path / "page.html").read_text()
-    assert data_of(tmp_path / "page.html")["runs"][0]["label"] == label
+    assert page.read_data(tmp_path / "page.html")["runs"][0]["label"] == label
 
 
 def test_a_page_that_would_be_too_large_has_coarser_curves(
@@ -163,7 +154,7 @@ def test_a_page_that_would_be_too_large_has_coarser_curves(
     monkeypatch.setattr(page, "POINTS", (10, 4))
     monkeypatch.setattr(page, "LARGEST", whole - 1)
     page.write_page(runs, tmp_path / "page.html", [None, None])
-    assert data_of(tmp_path / "page.html")["runs"][0]["curves"]["loss/td"]["steps"] == [1000, 4000, 7000, 10_000]
+    assert page.read_data(tmp_path / "page.html")["runs"][0]["curves"]["loss/td"]["steps"] == [1000, 4000, 7000, 10_000]
     monkeypatch.setattr(page, "LARGEST", coarse - 1)
     with pytest.raises(RunError, match="accepted: fewer runs"):
         page.write_page(runs, tmp_path / "page.html", [None, None])
@@ -195,7 +186,7 @@ def test_the_command_tells_why_there_is_no_episode(tmp_path: pathlib.Path, capsy
     run = make_run(tmp_path / "run", "mi", 2)
     assert report.main([str(run.path), "--html"]) == 0
     assert str(run.path / page.FILE) in capsys.readouterr().out
-    assert "seed 0 has no checkpoint yet" in data_of(run.path / page.FILE)["runs"][0]["episodes"]
+    assert "seed 0 has no checkpoint yet" in page.read_data(run.path / page.FILE)["runs"][0]["episodes"]
     for arguments, message in (
         (["--html", "--episode"], "--html: got it with --episode"),
         (["--html", "--seed", "9"], "--seed: got 9, accepted: 0, 1, 2"),
@@ -266,7 +257,7 @@ def test_a_moment_shows_what_is_seen_true_and_remembered(tab: Chromium) -> None:
     assert "bonus 0.450; sees what is otherwise hidden" in tab.text("#moment")  # weight 0.5
     tab.press("End")
     assert f"step {TOLD} (0.50), step {LENGTH} (0.50)" in tab.text("#panels .panel:nth-child(3)")
-    assert "down –" in tab.text("#series")  # nothing is done at the end
+    assert "down \u2013" in tab.text("#series")  # nothing is done at the end
     tab.press("ArrowLeft")
     assert "down 3.000" in tab.text("#series .taken")
 

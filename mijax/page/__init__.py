@@ -16,6 +16,7 @@ LARGEST = 5_000_000
 """Bytes of a page."""
 POINTS = (1000, 300, 100, 30)
 """Evaluations that a curve may show: the first of these numbers with which the page is not too large."""
+_BLOB = '<script type="application/json" id="data">/*DATA*/</script>'
 _FOLDER = pathlib.Path(__file__).parent
 _SCRIPTS = ("elements.js", "plot.js", "curves.js", "tables.js", "world.js", "episode.js")
 
@@ -68,6 +69,12 @@ def render(data: Mapping[str, Any]) -> str:
             .replace("/*DATA*/", blob))
 
 
+
+
+def read_data(path: pathlib.Path) -> dict[str, Any]:
+    """What `page_data` gave to a page that has been written."""
+    start, end = _BLOB.split("/*DATA*/")
+    return json.loads(path.read_text(encoding="utf-8").partition(start)[2].partition(end)[0])
 
 
 def _read(name: str) -> str:

@@ -67,12 +67,14 @@ function drawSeries() {
     const svg = add(frame, "svg", {class: "plot", role: "img", "aria-label": one.title});
     const values = one.lines.flatMap((line) => line.values).concat(one.best ?? []);
     const kept = one.floor === undefined ? values : values.filter((value) => value === null || value > one.floor);
-    const plot = new Plot(svg, {height: one.heat ? 180 : 140, x: [-0.5, last + 0.5], wholeTicks: true, wholeHeights: one.heat, left: 46,
-                                y: one.heat ? [-0.5, last + 0.5] : span(kept)});
+    const across = [-0.5, last + 0.5];
+    const plot = new Plot(svg, {
+      height: one.heat ? 180 : 140, x: across, y: one.heat ? across : span(kept), wholeTicks: true,
+      wholeHeights: one.heat, left: 46});
     episode.reveals.forEach((told, t) => {
       if (told) {
-        add(svg, "rect", {class: "told", x: plot.x(t - 0.5), width: plot.x(t + 0.5) - plot.x(t - 0.5), y: plot.top,
-                          height: plot.bottom - plot.top});
+        add(plot.inside, "rect", {class: "told", x: plot.x(t - 0.5), width: plot.x(t + 0.5) - plot.x(t - 0.5), y: plot.top,
+                                  height: plot.bottom - plot.top});
       }
     });
     if (one.heat) drawHeat(plot, attentionOf(episode));

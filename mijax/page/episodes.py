@@ -16,6 +16,8 @@ from mijax.evaluate_robot import is_robot
 from mijax.learner import Learner
 from mijax.page.numbers import finite
 
+NEAR = " Near is bright."
+"""Said of depth images, which are drawn inverted."""
 Episodes = dict[str, Any]
 """Some episodes of one run, as JSON has them."""
 
@@ -35,7 +37,7 @@ def episode_data(learner: Learner, trace: Trace, *, seed: int, step: int) -> Epi
     names = list(env.action_spec.names) or [str(action) for action in range(count)]
     return {
         "seed": seed, "step": step, "weight": learner.config.information.intrinsic_weight,
-        "actions": names, "discrete": discrete,
+        "actions": names, "discrete": discrete, "about": env.interface.observation + NEAR * is_robot(env),
         "variables": [{"name": variable.name, "hidden": variable.hidden} for variable in env.variables],
         "episodes": [_episode(learner, trace, index) for index in range(len(trace.length))],
     }

@@ -66,12 +66,16 @@ function columnsOf(lines) {
 }
 
 function fillOptions(all) {
-  const box = byId("option-table");
+  let box = byId("option-table");
   box.replaceChildren();
   const lines = DATA.options.filter((line) => all || line.differs);
   if (!lines.length) {
     add(box, "p", {class: "missing"}, DATA.options.length ? "The runs' options do not differ." : "No options were kept.");
     return;
+  }
+  if (all) {
+    box = add(box, "details", {open: DATA.runs.length > 1});
+    add(box, "summary", {}, `all ${lines.length} options`);
   }
   const scroll = add(box, "div", {class: "scroll", tabindex: 0, role: "region", "aria-label": "Options of the runs"});
   const table = add(scroll, "table");

@@ -1,5 +1,6 @@
 // The three panels of a moment: what the agent sees, what is true, what it remembers.
 const KINDS = {"#": "wall", "?": "info", G: "goal", x: "hell", o: "other", ".": ""};
+const MEANINGS = {G: "green: goal", x: "red: hell", "?": "blue: information", o: "sand: another end", "#": "dark: wall"};
 const STEPS = {right: [1, 0], up: [0, -1], left: [-1, 0], down: [0, 1]};
 
 function drawGrid(box, label, kinds) {
@@ -25,6 +26,7 @@ function drawPanels(shown, episode, step) {
   if (grid) drawGridPanels(shown, episode, step, seen, truth);
   else {
     drawView(seen, episode.seen, step, "seen");
+    if (shown.about) add(seen, "p", {}, shown.about);
     drawView(truth, episode.true, step, "true");
   }
   if (shown.variables.length) {
@@ -47,6 +49,8 @@ function drawGridPanels(shown, episode, step, seen, truth) {
   const left = drawGrid(seen, `The agent at ${at(cells[step])}; ${news}`, bare);
   add(seen, "p", {}, `Its place, and nothing of the walls; ${news}.`);
   const right = drawGrid(truth, `The agent at ${at(cells[step])}, the goal at ${at(goal)}`, kinds);
+  const there = new Set(kinds.join(""));
+  add(truth, "p", {}, Object.entries(MEANINGS).filter(([kind]) => there.has(kind)).map(([, text]) => text).join(", "));
   add(right, "polyline", {class: "way", points: cells.slice(0, step + 1).map((cell) => centre(cell).join(",")).join(" ")});
   for (const svg of [left, right]) {
     const [cx, cy] = centre(cells[step]);

@@ -27,10 +27,9 @@ class Chromium:
         commands, self._write = os.pipe()
         self._read, answers = os.pipe()
         theirs = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, 10) for descriptor in (commands, answers)]
-        sandbox = ["--no-sandbox"] if os.geteuid() == 0 else []  # Chromium's has no use for root
         self._process = subprocess.Popen(
             [sys.executable, "-c", _LAUNCH.format(*theirs), PROGRAM, "--headless", "--disable-gpu", "--hide-scrollbars",
-             "--remote-debugging-pipe", f"--user-data-dir={profile}", *sandbox],
+             "--no-sandbox", "--remote-debugging-pipe", f"--user-data-dir={profile}"],  # containers have no sandbox
             pass_fds=theirs, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         for descriptor in (commands, answers, *theirs):
             os.close(descriptor)

@@ -27,7 +27,8 @@ import tyro
 
 from envs_mjx import registry
 from envs_mjx.base import DiscreteActions
-from mijax import episode, evaluate, evaluate_robot, page, runtime
+from envs_mjx.grid.world import GridWorld
+from mijax import episode, evaluate, page, runtime
 from mijax.figures import display_name, draw_curves
 from mijax.learner import Learner, make_learner
 from mijax.metrics import RunError, RunFolder
@@ -39,7 +40,7 @@ from mijax.tables import markdown, run_table, seed_table, write_csv
 USER_ERRORS = evaluate.USER_ERRORS
 """What a user can mend: shown as one line."""
 EPISODES, EPISODES_OF_IMAGES = 4, 1
-"""Episodes of a run on a page; a robot's have two images per step."""
+"""Episodes of a run on a page; a robot's have three images per step. Grid worlds are drawn by their cells."""
 
 
 def write_report(runs: Sequence[ReportedRun], out: pathlib.Path, *, smooth: int = 1, note: str = "") -> str:
@@ -59,23 +60,24 @@ def write_report(runs: Sequence[ReportedRun], out: pathlib.Path, *, smooth: int 
 
 def report_page(runs: Sequence[ReportedRun], path: pathlib.Path, options: "ReportOptions") -> None:
     """Write the page of some runs; a run that cannot be played is shown without episodes, and the page says why."""
+    folders = [run.folder for run in runs if run.folder is not None]
+    if options.seed is not None:
+        for folder in folders:
+            _seed_of(folder, options.seed)
     shown: list[Episodes | str | None] = []
-    for run in runs:
-        assert run.folder is not None
-        if options.seed is not None:
-            _seed_of(run.folder, options.seed)
+    for run, folder in zip(runs, folders, strict=True):
         print(f"{run.label}: playing its newest checkpoint", file=sys.stderr)
         try:
-            many = EPISODES_OF_IMAGES if _robot(run.domain) else EPISODES
-            learner, seed, step, seen = _trace(run.folder, options.seed, many)
+            learner, seed, step, seen = _trace(folder, options.seed, _how_many(run.domain))
             shown.append(episode_data(learner, seen, seed=seed, step=step))
         except USER_ERRORS as error:
-            shown.append(str(error))
+            shown.append(str(error).replace(str(folder.path), run.label))  # a page is sent, a path says nothing there
     page.write_page(runs, path, shown, smooth=options.smooth, note=options.note)
 
 
-def _robot(domain: str) -> bool:
-    return evaluate_robot.is_robot(registry.make(domain))
+def _how_many(domain: str) -> int:
+    env = registry.make(domain)
+    return EPISODES_OF_IMAGES if env.observation_spec.is_image and not isinstance(env, GridWorld) else EPISODES
 
 
 def _seed_of(run: RunFolder, asked: int | None) -> int:

@@ -119,7 +119,8 @@ function fillReading(step, rows) {
     `${quantityName(curves.quantity)} at step ${readable(step, true)}; the boxes show and hide runs`;
   const table = add(box, "table");
   const head = add(add(table, "thead"), "tr");
-  for (const [name, kind] of [["run", ""], ["mean ± std", "number"], ["interquartile mean", "number"], ["each seed", ""]]) {
+  const columns = [["run", ""], ["mean ± std", "number"], ["interquartile mean", "number"], ["each seed", ""]];
+  for (const [name, kind] of columns) {
     add(head, "th", {scope: "col", class: kind}, name);
   }
   const body = add(table, "tbody");

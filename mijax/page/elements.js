@@ -45,6 +45,9 @@ function decimal(value) {
   return value === null || value === undefined ? "–" : value.toFixed(3).replace(/^-0\.000$/, "0.000");
 }
 
+// At most three digits, and none that say nothing: classes are numbers too.
+const shortest = (value) => value === null ? "–" : String(Number(value.toFixed(3)));
+
 function heading(name) {
   const known = {discounted_return: "discounted", fraction_of_optimum: "of optimum"};
   return known[name] ?? name.replaceAll("_", " ");
@@ -67,7 +70,7 @@ const domains = [...new Set(DATA.runs.map((run) => run.domain))];
 byId("title").textContent = domains.map(domainName).join(", ");
 document.title = `${byId("title").textContent} – mijax`;
 byId("note").textContent = [
-  DATA.runs.map((run) => run.label).join(", "),
+  DATA.runs.map((run) => run.label).join(" · "),
   DATA.smooth > 1 ? `curves: running mean over ${DATA.smooth} evaluations` : "",
   DATA.note,
 ].filter(Boolean).join("; ");

@@ -14,7 +14,7 @@ function attentionOf(episode) {
 }
 
 function strip(title, lines, options = {}) {
-  // lines: {name, values, colour, kind, points}
+  // lines: {name, values, colour, kind?, action?}; options: ring, best, floor, taken, heat
   return {title, lines, ...options};
 }
 
@@ -46,7 +46,9 @@ function stripsOf(shown, episode) {
       name, colour: DATA.palette[a % DATA.palette.length], values: until(episode.action.map((row) => row[a])),
     }))));
   }
-  if (episode.attention) strips.push(strip("Attention of each step (across) to those before it (up)", [], {heat: true}));
+  if (episode.attention) {
+    strips.push(strip("Attention of each step (across) to those before it (up)", [], {heat: true}));
+  }
   return strips;
 }
 
@@ -73,8 +75,9 @@ function drawSeries() {
       wholeHeights: one.heat, left: 46});
     episode.reveals.forEach((told, t) => {
       if (told) {
-        add(plot.inside, "rect", {class: "told", x: plot.x(t - 0.5), width: plot.x(t + 0.5) - plot.x(t - 0.5), y: plot.top,
-                                  height: plot.bottom - plot.top});
+        const left = plot.x(t - 0.5);
+        add(plot.inside, "rect", {
+          class: "told", x: left, width: plot.x(t + 0.5) - left, y: plot.top, height: plot.bottom - plot.top});
       }
     });
     if (one.heat) drawHeat(plot, attentionOf(episode));
@@ -172,13 +175,17 @@ function chooseRun(run) {
   const shown = DATA.runs[run].episodes;
   const playable = shown !== null && typeof shown !== "string";
   byId("episode-body").hidden = !playable;
-  byId("episode-missing").textContent = playable ? `Greedy, seed ${shown.seed}, checkpoint of step ${readable(shown.step, true)}.`
+  byId("episode-missing").textContent = playable
+    ? `Greedy, seed ${shown.seed}, checkpoint of step ${readable(shown.step, true)}.`
     : `No episode of this run: ${shown ?? "none was played"}.`;
   byId("episode-label").hidden = byId("head-label").hidden = !playable;
   if (!playable) return;
   select(byId("episode-number"), shown.episodes.map((episode, i) => {
     const steps = episode.reward.length - 1;
-    return [i, `${i + 1}: ${steps} steps, reward ${readable(episode.reward.reduce((sum, value) => sum + value, 0))}`];
+    const hidden = shown.variables.map((variable, v) =>
+      variable.hidden ? `, ${heading(variable.name)} ${shortest(episode.truth[0][v])}` : "");
+    const reward = readable(episode.reward.reduce((sum, value) => sum + value, 0));
+    return [i, `${i + 1}: ${steps} steps, reward ${reward}${hidden.join("")}`];
   }));
   byId("episode-label").hidden = shown.episodes.length < 2;
   const heads = shown.episodes[0].attention?.length ?? 0;
@@ -215,7 +222,12 @@ function chooseRun(run) {
     });
   }
   menu.addEventListener("change", () => { play(false); chooseRun(Number(menu.value)); });
-  number.addEventListener("change", () => { play(false); player.episode = Number(number.value); drawSeries(); goTo(0); });
+  number.addEventListener("change", () => {
+    play(false);
+    player.episode = Number(number.value);
+    drawSeries();
+    goTo(0);
+  });
   head.addEventListener("change", () => { player.head = Number(head.value); drawSeries(); goTo(player.step); });
   byId("position").addEventListener("input", (event) => { play(false); goTo(Number(event.target.value)); });
   byId("episode").addEventListener("keydown", (event) => {

@@ -70,7 +70,8 @@ function fillOptions(all) {
   box.replaceChildren();
   const lines = DATA.options.filter((line) => all || line.differs);
   if (!lines.length) {
-    add(box, "p", {class: "missing"}, DATA.options.length ? "The runs' options do not differ." : "No options were kept.");
+    add(box, "p", {class: "missing"},
+        DATA.options.length ? "The runs' options do not differ." : "No options were kept.");
     return;
   }
   if (all) {
@@ -97,8 +98,8 @@ function fillOptions(all) {
 (function startTables() {
   sortedTable(byId("run-table"), "Runs", columnsOf(DATA.run_table), DATA.run_table);
   sortedTable(byId("seed-table"), "Seeds", columnsOf(DATA.seed_table), DATA.seed_table);
-  byId("table-note").textContent = `Mean ± standard deviation over seeds; steps to the first evaluation with success ≥ ${
-    DATA.solved} (of a run: the median); seconds of wall time.`;
+  byId("table-note").textContent = "Mean ± standard deviation over seeds; steps to the first evaluation with success "
+    + `≥ ${DATA.solved} (of a run: the median); seconds of wall time.`;
   const several = DATA.runs.length > 1;
   if (several) {
     const label = add(byId("options-controls"), "label");

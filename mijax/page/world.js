@@ -1,6 +1,7 @@
 // The three panels of a moment: what the agent sees, what is true, what it remembers.
 const KINDS = {"#": "wall", "?": "info", G: "goal", x: "hell", o: "other", ".": ""};
-const MEANINGS = {G: "green: goal", x: "red: hell", "?": "blue: information", o: "sand: another end", "#": "dark: wall"};
+const MEANINGS = {G: "green: goal", x: "red: hell", "?": "blue: information", o: "sand: another end",
+                  "#": "grey: wall"};
 const STEPS = {right: [1, 0], up: [0, -1], left: [-1, 0], down: [0, 1]};
 
 function drawGrid(box, label, kinds) {
@@ -33,7 +34,7 @@ function drawPanels(shown, episode, step) {
     const list = add(truth, "dl");
     shown.variables.forEach(({name, hidden}, i) => {
       add(list, "dt", {}, `${heading(name)}${hidden ? " (hidden)" : ""}`);
-      add(list, "dd", {}, String(Number(episode.truth[step][i].toFixed(3))));
+      add(list, "dd", {}, shortest(episode.truth[step][i]));
     });
   }
   drawMemory(shown, episode, step, memory);
@@ -47,11 +48,12 @@ function drawGridPanels(shown, episode, step, seen, truth) {
   const bare = kinds.map((row, y) => [...row].map((_, x) => told[step] && y * width + x === goal ? "G" : ".").join(""));
   const news = told[step] ? `the goal is at ${at(goal)}` : "the goal is not shown";
   const left = drawGrid(seen, `The agent at ${at(cells[step])}; ${news}`, bare);
-  add(seen, "p", {}, `Its place, and nothing of the walls; ${news}.`);
+  add(seen, "p", {}, `Its place${kinds.join("").includes("#") ? ", and nothing of the walls" : ""}; ${news}.`);
   const right = drawGrid(truth, `The agent at ${at(cells[step])}, the goal at ${at(goal)}`, kinds);
   const there = new Set(kinds.join(""));
   add(truth, "p", {}, Object.entries(MEANINGS).filter(([kind]) => there.has(kind)).map(([, text]) => text).join(", "));
-  add(right, "polyline", {class: "way", points: cells.slice(0, step + 1).map((cell) => centre(cell).join(",")).join(" ")});
+  const way = cells.slice(0, step + 1).map((cell) => centre(cell).join(","));
+  add(right, "polyline", {class: "way", points: way.join(" ")});
   for (const svg of [left, right]) {
     const [cx, cy] = centre(cells[step]);
     add(svg, "circle", {class: "agent", cx, cy, r: 0.27});
@@ -72,7 +74,8 @@ function drawView(box, view, step, name) {
     const row = add(box, "div", {class: "pictures"});
     view.images.forEach((frames, channel) => {
       const figure = add(row, "figure");
-      add(figure, "img", {src: `data:image/png;base64,${frames[step]}`, alt: `channel ${channel}, ${name}, step ${step}`});
+      const alt = `channel ${channel}, ${name}, step ${step}`;
+      add(figure, "img", {src: `data:image/png;base64,${frames[step]}`, alt});
       add(figure, "figcaption", {}, `channel ${channel}`);
     });
   } else {
@@ -112,8 +115,9 @@ function drawMemory(shown, episode, step, box) {
       .map(([weight, t]) => `step ${t} (${weight.toFixed(2)})`).join(", ")}.`);
   }
   const colour = DATA.palette[0];
-  if (episode.explained) gauge(box, "Of z_s, f explains", episode.explained[step], colour);
-  if (episode.explained_by_agent) gauge(box, "Of z_s, its memory branch explains", episode.explained_by_agent[step], colour);
+  for (const [text, values] of [["f", episode.explained], ["its memory branch", episode.explained_by_agent]]) {
+    if (values) gauge(box, `Of z_s, ${text} explains`, values[step], colour);
+  }
   if (!episode.explained && !episode.explained_by_agent) {
     add(box, "p", {}, "This agent does not predict z_s: there is nothing to explain.");
   }

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from envs_mjx.base import Environment, EnvState, TimeStep
+from envs_mjx.base import DiscreteActions, Environment, EnvState, TimeStep
 from envs_mjx.grid import draw
 from envs_mjx.grid.world import GridWorld
 from mijax.figures import RING, STYLE
@@ -33,15 +33,19 @@ _INFORMATION = "#8cbef0"
 class Trace:
     """N greedy episodes; token t is what was known on arriving at step t. What follows an episode's end is meaningless.
 
-    Without a representation there is no bonus and nothing to explain; without a transformer, no attention.
+    Without a representation there is no bonus and nothing to explain; without a transformer, no attention. The values
+    of continuous actions are those of the actions taken, by the more cautious critic.
     """
 
     env_state: EnvState  # leaves (N, L, ...)
+    observation: np.ndarray  # (N, L, *observation_shape)
+    state: np.ndarray  # (N, L, *state_shape)
+    truth: np.ndarray  # (N, L, V) float32, the environment's variables
     reward: np.ndarray  # (N, L) float32, the task's, on arriving
     reveals: np.ndarray  # (N, L) bool, whether the observation shows what is otherwise hidden
     length: np.ndarray  # (N,) int32, steps
-    action: np.ndarray  # (N, L) int32, taken after token t
-    q: np.ndarray  # (N, L, A)
+    action: np.ndarray  # (N, L) int32, or of continuous actions (N, L, A) float32, taken after token t
+    q: np.ndarray  # (N, L, A), or of continuous actions (N, L, 1)
     bonus: np.ndarray | None  # (N, L) with weight 1, on arriving; 0 at the start
     explained: np.ndarray | None  # (N, L) fraction of the variance of z_s that f(h_t) explains
     explained_by_agent: np.ndarray | None  # (N, L) the same of the memory branch (the auxiliary task)
@@ -87,18 +91,43 @@ def _trace(learner: Learner, state: LearnerState, key: jax.Array, num: int) -> d
     env_state, timestep, previous, action = cast(tuple[EnvState, TimeStep, jax.Array, jax.Array], whole)
     length = jnp.argmax(timestep.done, axis=1).astype(jnp.int32)
     tokens = _tokens(learner, state.representation, timestep, previous, length)
-    outputs, seen = agent.network.apply({"params": state.agent.target}, tokens, mutable=["intermediates"])
-    attention = jax.tree.leaves(seen)
+    tokens, q, predicted, attention = _look_inside(learner, state, tokens, action)
     return {
-        "env_state": env_state, "reward": timestep.reward, "length": length, "action": action, "q": outputs.q,
-        "reveals": jax.vmap(jax.vmap(env.reveals))(env_state), "attention": attention[-1] if attention else None,
-    } | _information(learner, state, tokens, outputs.z_s)
+        "env_state": env_state, "observation": timestep.observation, "state": timestep.state,
+        "truth": jax.vmap(jax.vmap(learner.domain.ground_truth))(env_state), "reward": timestep.reward,
+        "reveals": jax.vmap(jax.vmap(env.reveals))(env_state), "length": length, "action": action, "q": q,
+        "attention": attention,
+    } | _information(learner, state, tokens, predicted)
+
+
+def _look_inside(
+    learner: Learner, state: LearnerState, tokens: Tokens, action: jax.Array
+) -> tuple[Tokens, jax.Array, jax.Array | None, jax.Array | None]:
+    """The tokens as f looks at them, and of whole episodes the values, the predicted z_s and the attention."""
+    agent, variables = learner.agent, {"params": state.agent.target}
+    if isinstance(learner.env.action_spec, DiscreteActions):
+        outputs, seen = agent.network.apply(variables, tokens, mutable=["intermediates"])
+        q, predicted = outputs.q, outputs.z_s
+    else:
+        tokens = agent.network.apply(variables, tokens, method="look")
+        if agent.looks_once and state.representation is not None:  # the critics see phi's body of the state
+            phi = encoder_for(learner.env.state_spec, learner.config.stage1.features)
+            body = phi.apply({"params": state.representation.phi}, tokens.states, method="body")
+            tokens = dataclasses.replace(tokens, states=body)
+        encoded, seen = agent.network.apply(variables, tokens, method="encode", mutable=["intermediates"])
+        taken = action.reshape(-1, action.shape[-1])
+        values = agent.network.apply(variables, encoded.critic, taken, method="values")
+        q = jnp.min(values, axis=0).reshape(*action.shape[:2], 1)
+        predicted = encoded.heads[0].z_s if encoded.heads else None
+    found = seen.get("intermediates", {})
+    attention = jax.tree.leaves(found.get("actor", found))  # an actor's own memory, not its critics'
+    return tokens, q, predicted, attention[-1] if attention else None
 
 
 def _tokens(learner: Learner, representation: Representation | None, timestep: TimeStep, previous: jax.Array,
             length: jax.Array) -> Tokens:
     """One episode per row."""
-    z_s, position = None, jnp.broadcast_to(jnp.arange(previous.shape[1])[None], previous.shape)
+    z_s, position = None, jnp.broadcast_to(jnp.arange(previous.shape[1])[None], previous.shape[:2])
     if representation is not None:
         phi = encoder_for(learner.env.state_spec, learner.config.stage1.features)
         z_s = cast(jax.Array, phi.apply({"params": representation.phi}, timestep.state))

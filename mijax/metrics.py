@@ -6,6 +6,8 @@
     RUN/summary.json            at the end: see `mijax.results.summarise`
     RUN/curve.png
 
+A published result has its metrics as RUN/metrics_seed_K.jsonl, without the seeds' folders.
+
 A line of metrics has `step` (environment steps of this seed) and numbers by name. A number under `wall/` is the seconds
 since the previous line, so that lines dropped on resuming take their seconds with them.
 """
@@ -88,6 +90,10 @@ class RunFolder:
         """What the run was started with: python, packages, platform, commit."""
         return _read_json(self._file("versions.json"))
 
+    def has_versions(self) -> bool:
+        """Whether it is known what the run was started with."""
+        return self._file("versions.json").exists()
+
     def require(self, **options: Any) -> None:
         """Raise `RunError` unless the run has these options, e.g. `run.require(domain="sphinx")`."""
         config = self.config()
@@ -96,9 +102,10 @@ class RunFolder:
                 raise RunError(f"{self.path}: is a run with {name} {config.get(name)!r}, wanted {expected!r}")
 
     def seeds(self) -> tuple[int, ...]:
-        """The seeds that have a folder, in order."""
-        names = (entry.name.removeprefix("seed_") for entry in self.path.glob("seed_*") if entry.is_dir())
-        return tuple(sorted(int(name) for name in names if name.isdigit()))
+        """The seeds that have a folder, or published metrics, in order."""
+        names = [entry.name.removeprefix("seed_") for entry in self.path.glob("seed_*") if entry.is_dir()]
+        names += [entry.stem.removeprefix("metrics_seed_") for entry in self.path.glob("metrics_seed_*.jsonl")]
+        return tuple(sorted({int(name) for name in names if name.isdigit()}))
 
     def seed_path(self, seed: int) -> pathlib.Path:
         """The folder of one seed."""
@@ -153,7 +160,8 @@ class RunFolder:
         return self.path / name
 
     def _metrics_file(self, seed: int) -> pathlib.Path:
-        return self.seed_path(seed) / "metrics.jsonl"
+        published = self._file(f"metrics_seed_{seed}.jsonl")
+        return published if published.exists() else self.seed_path(seed) / "metrics.jsonl"
 
 
 def _plain(value: Any) -> Any:

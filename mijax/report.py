@@ -5,6 +5,12 @@
 Writes into DIR: `curve.png` (`curve_DOMAIN.png` for each, when the runs are of several domains), `runs.csv`,
 `seeds.csv` and `report.md` with both tables, which are also printed.
 
+    python -m mijax.report RUN... --html [--seed K] [--out DIR]
+
+Writes `report.html` beside them: one file that opens in any browser, without a network. It has the curves of every
+quantity, the tables, what the runs' options differ in, and greedy episodes of each run's newest checkpoint to step
+through: what the agent sees, what is true, what it remembers.
+
     python -m mijax.report RUN --episode [--seed K] [--out DIR]
 
 Plays the newest checkpoint greedily and draws one episode, `episode_seed_K.png`: the path, the intrinsic reward of each
@@ -21,16 +27,20 @@ import tyro
 
 from envs_mjx import registry
 from envs_mjx.base import DiscreteActions
-from mijax import episode, evaluate, runtime
+from envs_mjx.grid.world import GridWorld
+from mijax import episode, evaluate, page, runtime
 from mijax.figures import display_name, draw_curves
-from mijax.learner import make_learner
+from mijax.learner import Learner, make_learner
 from mijax.metrics import RunError, RunFolder
+from mijax.page.episodes import Episodes, episode_data
 from mijax.results import ReportedRun, load
 from mijax.seeds import evaluation_key
 from mijax.tables import markdown, run_table, seed_table, write_csv
 
 USER_ERRORS = evaluate.USER_ERRORS
 """What a user can mend: shown as one line."""
+EPISODES, EPISODES_OF_IMAGES = 4, 1
+"""Episodes of a run on a page; a robot's have three images per step. Grid worlds are drawn by their cells."""
 
 
 def write_report(runs: Sequence[ReportedRun], out: pathlib.Path, *, smooth: int = 1, note: str = "") -> str:
@@ -48,21 +58,55 @@ def write_report(runs: Sequence[ReportedRun], out: pathlib.Path, *, smooth: int 
     return text
 
 
+def report_page(runs: Sequence[ReportedRun], path: pathlib.Path, options: "ReportOptions") -> None:
+    """Write the page of some runs; a run that cannot be played is shown without episodes, and the page says why."""
+    folders = [run.folder for run in runs if run.folder is not None]
+    if options.seed is not None:
+        for folder in folders:
+            _seed_of(folder, options.seed)
+    shown: list[Episodes | str | None] = []
+    for run, folder in zip(runs, folders, strict=True):
+        print(f"{run.label}: playing its newest checkpoint", file=sys.stderr)
+        try:
+            learner, seed, step, seen = _trace(folder, options.seed, _how_many(run.domain))
+            shown.append(episode_data(learner, seen, seed=seed, step=step))
+        except USER_ERRORS as error:
+            shown.append(str(error).replace(str(folder.path), run.label))  # a page is sent, a path says nothing there
+    page.write_page(runs, path, shown, smooth=options.smooth, note=options.note)
+
+
+def _how_many(domain: str) -> int:
+    env = registry.make(domain)
+    return EPISODES_OF_IMAGES if env.observation_spec.is_image and not isinstance(env, GridWorld) else EPISODES
+
+
+def _seed_of(run: RunFolder, asked: int | None) -> int:
+    """The seed that was asked for, or the run's first."""
+    seeds = run.seeds()
+    seed = next(iter(seeds), 0) if asked is None else asked
+    if seed not in seeds:
+        raise RunError(f"--seed: got {seed}, accepted: {', '.join(map(str, seeds)) or 'none, the run has no seed yet'}")
+    return seed
+
+
+def _trace(run: RunFolder, asked: int | None, episodes: int) -> tuple[Learner, int, int, episode.Trace]:
+    """Greedy episodes of a seed's newest checkpoint: the learner, the seed, the checkpoint's step, the trace."""
+    config, seed = evaluate.config_of(run), _seed_of(run, asked)
+    learner = make_learner(registry.make(config.domain), config)
+    step, state = evaluate.load_learner_state(run, seed, learner)
+    return learner, seed, step, episode.trace(learner, state, evaluation_key(seed, step), episodes)
+
+
 def report_episode(options: "ReportOptions") -> pathlib.Path:
     """Draw a greedy episode of a run's newest checkpoint; returns the figure's path."""
     if len(options.runs) != 1:
         raise RunError(f"--episode: got {len(options.runs)} runs, accepted: one")
     run = RunFolder.open(options.runs[0])
-    config, seeds = evaluate.config_of(run), run.seeds()
-    seed = next(iter(seeds), 0) if options.seed is None else options.seed
-    if seed not in seeds:
-        raise RunError(f"--seed: got {seed}, accepted: {', '.join(map(str, seeds)) or 'none, the run has no seed yet'}")
-    learner = make_learner(registry.make(config.domain), config)
-    if not isinstance(learner.env.action_spec, DiscreteActions):
+    config = evaluate.config_of(run)
+    if not isinstance(registry.make(config.domain).action_spec, DiscreteActions):
         raise RunError(f"--episode: {config.domain} has continuous actions, accepted: a run with discrete ones; for a "
-                       f"film: python -m mijax.evaluate {run.path} --gif")
-    step, state = evaluate.load_learner_state(run, seed, learner)
-    seen = episode.trace(learner, state, evaluation_key(seed, step), 1)
+                       f"page: --html, for a film: python -m mijax.evaluate {run.path} --gif")
+    learner, seed, step, seen = _trace(run, options.seed, 1)
     path = (options.out or run.path) / f"episode_seed_{seed}.png"
     title = f"{display_name(config.domain)}, {config.agent}, seed {seed}, step {step:,}"
     episode.draw_episode(seen, 0, learner.domain, path, title=title, weight=config.information.intrinsic_weight)
@@ -85,6 +129,8 @@ class ReportOptions:
     """A line to print under each figure."""
     episode: bool = False
     """Draw a greedy episode of one run instead of its curves and tables."""
+    html: bool = False
+    """Write a page to look at beside the tables: curves of every quantity, options, episodes to step through."""
     seed: int | None = None
     """Whose episode; default: the run's first seed."""
 
@@ -97,13 +143,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise RunError("runs: got none, accepted: one run folder or more")
         if options.smooth < 1:
             raise RunError(f"--smooth: got {options.smooth}, accepted: a number >= 1")
-        if options.episode:
+        if options.episode and options.html:
+            raise RunError("--html: got it with --episode, accepted: one of them; the page has episodes too")
+        if options.episode or options.html:
             runtime.prepare()
+        if options.episode:
             print(f"Written to {report_episode(options)}")
             return 0
         out = options.out or (options.runs[0] if len(options.runs) == 1 else pathlib.Path("runs/report"))
-        print(write_report(load(options.runs, options.labels), out, smooth=options.smooth, note=options.note))
-        print(f"Written to {out}")
+        runs = load(options.runs, options.labels)
+        print(write_report(runs, out, smooth=options.smooth, note=options.note))
+        if options.html:
+            report_page(runs, out / page.FILE, options)
+        print(f"Written to {out / page.FILE if options.html else out}")
     except USER_ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -93,6 +93,8 @@ class ReportedRun:
     summary: Mapping[str, Any]
     metrics: Mapping[int, Sequence[Row]]
     """The lines of each seed."""
+    folder: RunFolder | None = None
+    """Where it comes from, when it is one folder's."""
 
     @property
     def domain(self) -> str:
@@ -120,7 +122,7 @@ def load(paths: Sequence[pathlib.Path], labels: Sequence[str] = ()) -> list[Repo
     if len(set(labels)) != len(labels):
         raise RunError(f"--labels: got {' '.join(labels)}, accepted: a different one for each run")
     colours = _colours([str(summary.get("agent")) for summary in summaries])
-    return [ReportedRun(label, colour, summary, {seed: folder.metrics(seed) for seed in folder.seeds()})
+    return [ReportedRun(label, colour, summary, {seed: folder.metrics(seed) for seed in folder.seeds()}, folder)
             for label, colour, summary, folder in zip(labels, colours, summaries, folders, strict=True)]
 
 

@@ -2,23 +2,28 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from compass import Compass
 from PIL import Image
 
 from envs_mjx import registry
-from mijax import report
+from mijax import page, report
 from mijax.checkpoint import Checkpoints
 from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig, Stage1Config
 from mijax.episode import Trace, trace
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.metrics import RunFolder
 from mijax.representation import learn_representation
+from mijax.representation.model import init_parameters, networks_for
 from mijax.representation.storage import save_representation
 from mijax.seeds import training_key
 from mijax.stage1 import folder_of
+from mijax.types import Representation
 
 STAGE1 = Stage1Config(episodes=20, epochs=1, batch_size=200, features=4)
 CONFIG = Config(
@@ -89,8 +94,8 @@ def test_peaks_are_compared_with_the_first_information(seen: Trace) -> None:
 
 @pytest.mark.parametrize(("agent", "memory"), [("mi", "gpt"), ("base", "gru")])
 def test_the_command_draws_an_episode_of_each_kind(
-    ours: tuple[Learner, LearnerState], tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], agent: str,
-    memory: str
+    ours: tuple[Learner, LearnerState], tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, agent: str, memory: str
 ) -> None:
     learner, state = ours
     config = dataclasses.replace(CONFIG, agent=agent, memory=memory)
@@ -111,6 +116,37 @@ def test_the_command_draws_an_episode_of_each_kind(
     colours = {colour for count, colour in image.getcolors(image.width * image.height) or [] if count > 30}
     assert ((214, 39, 40) in colours) is (agent == "mi")  # the red ring
     assert (96, 186, 110) in colours  # the goal's cell
+    run.append(2, {"step": 200, "evaluation/success": 0.5})
+    monkeypatch.setattr(report, "EPISODES", 1)  # the program of the figure, which is compiled already
+    assert report.main([str(run.path), "--html"]) == 0
+    shown = page.read_data(run.path / page.FILE)["runs"][0]["episodes"]
+    assert (shown["seed"], shown["step"], len(shown["episodes"])) == (2, 200, 1)
+    (one,) = shown["episodes"]
+    np.testing.assert_array_equal(np.array(one["q"])[:-1].argmax(1), one["action"][:-1])
+    assert (one["explained"] is None) is (agent == "base")
+    assert (one["attention"] is None) is (memory == "gru")
+
+
+def test_continuous_actions_are_traced() -> None:
+    learner = make_learner(Compass(), CONFIG)
+    shapes = [jnp.zeros((1, *spec.shape)) for spec in (learner.env.state_spec, learner.env.observation_spec)]
+    encoders = init_parameters(networks_for(learner.env, STAGE1.features), jax.random.key(5), *shapes)
+    representation = Representation(encoders["phi"], encoders["psi"], jnp.zeros(STAGE1.features), jnp.float32(1))
+    agent = jax.jit(learner.agent.init)(training_key(0), representation)
+    unused: Any = None
+    state = LearnerState(agent, representation, unused, unused, unused, unused)
+    seen = trace(learner, state, jax.random.key(3), 6)
+    assert seen.action.shape == (6, 5, 2)
+    assert seen.q.shape == (6, 5, 1)
+    assert np.isfinite(seen.q).all()
+    assert seen.length.tolist() == [Compass.choice + 1] * 6
+    assert seen.bonus is not None
+    assert seen.attention is not None
+    np.testing.assert_allclose(seen.attention[:, :, :4].sum(-1), 1, atol=1e-5)
+    # the action that was taken is the one that leads to the next observation
+    pointed = np.sum(seen.action[:, Compass.choice] * seen.state[:, 0, :2], axis=-1)
+    norm = np.linalg.norm(seen.action[:, Compass.choice], axis=-1)
+    np.testing.assert_array_equal(seen.reward[:, Compass.choice + 1] > 0, pointed > 0.7071 * norm)
 
 
 def test_what_cannot_be_drawn_is_named(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -57,6 +57,11 @@ def text(env: Environment, env_state: GridState) -> str:
     return "\n".join([*(" ".join(line) for line in kinds), _caption(world, env_state)])
 
 
+def letters(env: Environment, env_state: GridState) -> list[str]:
+    """The world alone, a string per row: G goal, ? information, x hell, o wrong corner, # wall, . free."""
+    return ["".join(line) for line in _layout(env, env_state)[1]]
+
+
 def save_gif(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float = 4) -> None:
     """Write frames (height, width, 3) uint8 as an animated GIF that loops; the last frame stays for a second."""
     if not frames or fps <= 0:

@@ -140,9 +140,12 @@ def _add_texts(figure: Figure, axes: np.ndarray, runs: Sequence[ReportedRun], no
                            handlelength=1.6, title=display_name(runs[0].domain), alignment="left")
     legend.get_title().set(fontsize=12, fontweight="bold")
     if note:
-        figure.supxlabel(note, x=0.01, ha="left", fontsize=7.5, color="#666666")
+        lines = textwrap.fill(note, int(CHARACTERS_PER_INCH * figure.get_figwidth()))
+        figure.supxlabel(lines, x=0.01, ha="left", fontsize=7.5, color="#666666")
 
 
+CHARACTERS_PER_INCH = 17
+"""Of a note under a figure."""
 PAPER_NAMES = {
     "heaven_hell": "Heaven-Hell", "sphinx": "Sphinx", "carflag_2d": "CarFlag-2D", "block_pulling": "Block-Pulling",
     "block_pushing": "Block-Pushing", "drawer_opening": "Drawer-Opening"}
@@ -197,7 +200,7 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
                                ncols=2 if len(groups) == 1 else 2 * len(groups), title=title, alignment="left")
         legend.get_title().set(fontsize=12, fontweight="bold")
         if note:
-            lines = textwrap.fill(note, int(17 * width))
+            lines = textwrap.fill(note, int(CHARACTERS_PER_INCH * width))
             figure.supxlabel(lines, x=0.01, ha="left", fontsize=7.5, color="#666666")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)

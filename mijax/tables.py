@@ -14,12 +14,17 @@ Table = list[dict[str, Any]]
 """Lines of named cells; None is an empty one."""
 
 
+def _plain(label: str) -> str:
+    """A label of a figure without its mathematical markup."""
+    return label.replace("$", "")
+
+
 def seed_table(runs: Sequence[ReportedRun]) -> Table:
     """A line per run and seed."""
     parts = sorted({part for run in runs for seed in run.summary["seeds"].values() for part in seed["wall"]})
     return [
         {
-            "run": run.label, "domain": run.domain, "seed": int(seed),
+            "run": _plain(run.label), "domain": run.domain, "seed": int(seed),
             **{quantity: results.get(quantity) for quantity in QUANTITIES},
             "steps": results.get("steps"), "steps_to_solve": results.get("steps_to_solve"),
             **{f"wall_{part}": results["wall"].get(part) for part in parts},
@@ -34,7 +39,7 @@ def run_table(runs: Sequence[ReportedRun]) -> Table:
     table = []
     for run in runs:
         seeds = list(run.summary["seeds"].values())
-        line: dict[str, Any] = {"run": run.label, "domain": run.domain, "seeds": len(seeds)}
+        line: dict[str, Any] = {"run": _plain(run.label), "domain": run.domain, "seeds": len(seeds)}
         for quantity in QUANTITIES:
             scores = [seed[quantity] for seed in seeds if seed.get(quantity) is not None]
             mean, std = statistics.mean_std(np.array(scores)) if scores else (None, None)
@@ -116,7 +121,7 @@ def comparison_table(runs: Sequence[ReportedRun]) -> Table:
     table = []
     for place, run in enumerate(runs):
         seeds = list(run.summary["seeds"].values())
-        line: dict[str, Any] = {"run": run.label, "seeds": len(seeds)}
+        line: dict[str, Any] = {"run": _plain(run.label), "seeds": len(seeds)}
         for name, scores in (("success", _column(seeds, "success")), ("return", _column(seeds, "return")),
                              ("reveals", _column(seeds, "reveals")), ("area", areas[place])):
             if len(scores):

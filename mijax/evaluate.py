@@ -212,12 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = tyro.cli(EvaluateOptions, args=list(arguments), prog="python -m mijax.evaluate")
     runtime.prepare()
-    try:
-        evaluate(options)
-    except USER_ERRORS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return runtime.exit_code(lambda: evaluate(options), USER_ERRORS)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import gc
 import os
 import pathlib
 import sys
+from collections.abc import Callable
 
 import jax
 
@@ -40,3 +41,13 @@ def release_memory() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
+
+
+def exit_code(work: Callable[[], object], user_errors: tuple[type[BaseException], ...]) -> int:
+    """0 once a command's work is done; 1 after one line on what the user can mend."""
+    try:
+        work()
+    except user_errors as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0

@@ -207,12 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = tyro.cli(TransferOptions, args=list(arguments), prog="python -m mijax.transfer")
     runtime.prepare()
-    try:
-        transfer(options)
-    except evaluate.USER_ERRORS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return runtime.exit_code(lambda: transfer(options), evaluate.USER_ERRORS)
 
 
 if __name__ == "__main__":

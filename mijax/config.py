@@ -180,6 +180,10 @@ class DQNConfig:
             value = getattr(self, name)
             require(0 <= value <= 1, f"dqn.{name}".replace("_", "-"), value, "a number in [0, 1]")
 
+    def updates_in(self, steps: int) -> int:
+        """Gradient updates of a run of so many environment steps."""
+        return max(1, round(steps * self.updates_per_step))
+
 
 @dataclasses.dataclass(frozen=True)
 class SACConfig:
@@ -214,8 +218,12 @@ class SACConfig:
     """Episodes of the environment's expert in the replay from the start, for good (paper: 80 on the robots)."""
     demonstration_share: float = 0.0
     """Probability with which an episode of a batch is drawn among the demonstrations alone (paper: 0)."""
+    pretrain_updates: int = 0
+    """Updates on the demonstrations before the agent acts for the first time (paper: 0)."""
     imitation_weight: float = 0.0
     """Weight of the squared distance between the actor's mean action and a demonstration's (paper: 0)."""
+    imitation_until: float = 1.0
+    """Fraction of the run's updates after which that weight has fallen linearly to 0."""
     rotated_copies: int = 0
     """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
     original (paper: 4 on the robots)."""
@@ -231,13 +239,22 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         _require_at_least("sac.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes")
-        _require_at_least("sac.", self, 0, "demonstrations", "rotated_copies", "imitation_weight")
+        _require_at_least("sac.", self, 0, "demonstrations", "rotated_copies", "pretrain_updates", "imitation_weight")
         for name in ("learning_rate", "updates_per_step", "initial_temperature"):
             require(getattr(self, name) > 0, f"sac.{name}".replace("_", "-"), getattr(self, name), "a number > 0")
         require(self.batch_episodes % 2 == 0, "sac.batch-episodes", self.batch_episodes, "an even number")
-        for name in ("discount", "trace_decay", "target_rate", "final_learning_rate", "demonstration_share"):
+        for name in ("discount", "trace_decay", "target_rate", "final_learning_rate", "demonstration_share",
+                     "imitation_until"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"sac.{name}".replace("_", "-"), value, "a number in [0, 1]")
+        for name in ("pretrain_updates", "imitation_weight"):
+            value = getattr(self, name)
+            require(self.demonstrations > 0 or value == 0, f"sac.{name}".replace("_", "-"), value,
+                    "0, unless there are --sac.demonstrations")
+
+    def updates_in(self, steps: int) -> int:
+        """Gradient updates of a run of so many environment steps."""
+        return self.pretrain_updates + max(1, round(steps * self.updates_per_step))
 
 
 @dataclasses.dataclass(frozen=True)

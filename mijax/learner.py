@@ -85,6 +85,8 @@ class Learner:
         state, _ = self._collect(state, jnp.ones(()), self.warmup_steps // num_envs, key_warmup)
         if self.agent.declaration.believes:
             state = dataclasses.replace(state, agent=self._believe(state, jax.random.fold_in(key_agent, 1)))
+        if self.demonstrations and self.config.sac.pretrain_updates:
+            state, _ = self._learn(state, jax.random.fold_in(key_agent, 2), self.config.sac.pretrain_updates)
         return state
 
     def _first(self, representation: Representation | None, episodes: Episodes) -> StepRecord:
@@ -164,7 +166,7 @@ class Learner:
             key_collect, key_update = jax.random.split(jax.random.fold_in(state.key, state.iteration))
             epsilon = self.epsilon(self.environment_steps(state))
             state, totals = self._collect(state, epsilon, self.config.steps_per_iteration, key_collect)
-            state, metrics = self._learn(state, key_update)
+            state, metrics = self._learn(state, key_update, self.updates_per_iteration)
             return dataclasses.replace(state, iteration=state.iteration + 1), (totals, metrics)
 
         state, (totals, losses) = jax.lax.scan(iterate, state, None, iterations or self.iterations_per_chunk)
@@ -244,11 +246,11 @@ class Learner:
         (episodes, replay, totals), _ = jax.lax.scan(step, carry, jax.random.split(key, steps))
         return dataclasses.replace(state, episodes=episodes, replay=replay), totals
 
-    def _learn(self, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Metrics]:
+    def _learn(self, state: LearnerState, key: jax.Array, updates: int) -> tuple[LearnerState, Metrics]:
         def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, Metrics]:
             return self.update(agent, state.replay, state.representation, key)
 
-        agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, self.updates_per_iteration))
+        agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, updates))
         return dataclasses.replace(state, agent=agent), jax.tree.map(jnp.mean, metrics)
 
     def update(

@@ -119,7 +119,7 @@ def test_td_loss_by_hand(states: dict[str, AgentState], bootstrap: bool, trace_d
     network: Any = jax.jit(agent.network.apply)
     q, q_target = (network({"params": p}, tokens).q for p in (state.params["agent"], state.target))
     expected, cut = loss_by_loops(q, q_target, np.zeros((2, ROW)), config.dqn)
-    loss, metrics = jax.jit(agent.loss)(state.params, state.target, tokens, None, jax.random.key(0))
+    loss, metrics = jax.jit(agent.loss)(state.params, state.target, tokens, None, state.updates, jax.random.key(0))
     assert 0 < cut < 6
     assert float(loss) == pytest.approx(expected, rel=1e-4)
     assert float(metrics["loss/td"]) == pytest.approx(expected, rel=1e-4)
@@ -154,7 +154,7 @@ def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: A
                 before, after = (np.sum((z[row, t] - unseen[i]) ** 2) for i in (t - 1, t))
                 bonus[row, t] = 0.5 * (before - after) / 2.0
     expected, _ = loss_by_loops(q, q_target, bonus, config.dqn)
-    loss, metrics = jax.jit(agent.loss)(state.params, state.target, tokens, rep, jax.random.key(0))
+    loss, metrics = jax.jit(agent.loss)(state.params, state.target, tokens, rep, state.updates, jax.random.key(0))
     assert float(metrics["loss/f"]) == pytest.approx(np.mean(errors_f), rel=1e-4)
     assert float(metrics["loss/auxiliary"]) == pytest.approx(np.mean(errors_k), rel=1e-4)
     assert float(metrics["loss/td"]) == pytest.approx(expected, rel=1e-4)
@@ -169,7 +169,7 @@ def test_f_learns_from_its_own_loss_only(states: dict[str, AgentState]):
     @jax.jit
     def gradients(params: Any) -> tuple[Any, Any]:
         def part(params: Any, name: str) -> jax.Array:
-            return agent.loss(params, state.target, tokens, rep, jax.random.key(0))[1][name]
+            return agent.loss(params, state.target, tokens, rep, state.updates, jax.random.key(0))[1][name]
 
         return jax.grad(part)(params, "loss/td"), jax.grad(part)(params, "loss/f")
 
@@ -205,7 +205,7 @@ def test_loss_under_vmap_equals_one_by_one(states: dict[str, AgentState]):
     both = jax.tree.map(lambda x: jnp.stack([x, x * 1.1]), state.params)
 
     def loss(params: Any) -> jax.Array:
-        return agent.loss(params, state.target, tokens, None, jax.random.key(0))[0]
+        return agent.loss(params, state.target, tokens, None, state.updates, jax.random.key(0))[0]
 
     np.testing.assert_allclose(jax.jit(jax.vmap(loss))(both), jax.lax.map(loss, both), rtol=1e-4)
 

@@ -14,7 +14,7 @@ from scipy import integrate, stats
 from envs_mjx.base import ArraySpec, ContinuousActions, Environment
 from mijax.agents.core import AgentState
 from mijax.agents.factory import make_agent
-from mijax.agents.sac import SAC
+from mijax.agents.sac import SAC, make_sac
 from mijax.agents.variants import VARIANTS, needs_representation, title_of
 from mijax.config import (
     BelieverConfig,
@@ -90,9 +90,7 @@ class Case:
     def __init__(self, name: str, **changes: Any) -> None:
         self.config = dataclasses.replace(CONFIG, agent=name, **changes)
         env = StateShown(Shapes()) if name == "mdp" else Shapes()
-        agent = make_agent(env, self.config)
-        assert isinstance(agent, SAC)
-        self.sac, self.tokens = agent, episodes()
+        self.sac, self.tokens = make_sac(env, self.config), episodes()
         if name == "mdp":
             both = jnp.concatenate([jnp.asarray(self.tokens.states), jnp.asarray(self.tokens.frames)], -1)
             self.tokens = dataclasses.replace(self.tokens, frames=both)
@@ -114,9 +112,10 @@ class Case:
 
         return jax.jit(run)(params, tokens, jnp.asarray(action))
 
-    def losses(self) -> tuple[float, dict[str, float]]:
+    def losses(self, updates: int = 0) -> tuple[float, dict[str, float]]:
         loss, metrics = jax.jit(self.sac.loss)(
-            self.state.params, self.state.target, self.tokens, self.representation, jax.random.key(0))
+            self.state.params, self.state.target, self.tokens, self.representation, jnp.int32(updates),
+            jax.random.key(0))
         return float(loss), {name: float(value) for name, value in metrics.items()}
 
 
@@ -167,8 +166,9 @@ def drawn_by_hand(mean: Any, log_scale: Any, noise: Any) -> tuple[np.ndarray, np
 @pytest.mark.parametrize(("name", "bootstrap", "trace_decay"), [("base", False, 0.0), ("mi", True, 0.7)])
 def test_losses_by_hand(name: str, bootstrap: bool, trace_decay: float):
     options = dataclasses.replace(
-        CONFIG.sac, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay, imitation_weight=0.7)
-    case = Case(name, sac=options)
+        CONFIG.sac, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay, demonstrations=1, imitation_weight=1.4,
+        imitation_until=0.5)
+    case, quarter = Case(name, sac=options), options.updates_in(CONFIG.steps) // 4
     if name == "base":  # the first and the last episode are an expert's
         case.tokens = dataclasses.replace(case.tokens, demonstrated=case.tokens.segment != 2)
     tokens, params, agent = jax.device_get(case.tokens), case.state.params, case.state.params["agent"]
@@ -208,7 +208,7 @@ def test_losses_by_hand(name: str, bootstrap: bool, trace_decay: float):
             errors.append(np.sum((later - np.asarray(q)[:, row, t - 1]) ** 2))
             advantages.append(0.3 * log_prob[row, t - 1] - q_drawn[:, row, t - 1].min())
             entropies.append(-log_prob[row, t - 1])
-    loss, metrics = case.losses()
+    loss, metrics = case.losses(updates=quarter)  # half of the time of imitation: 0.7 is left of its weight
     expected |= {"loss/td": np.mean(errors), "loss/actor": np.mean(advantages), "actor/entropy": np.mean(entropies)}
     for part, value in expected.items():
         assert metrics[part] == pytest.approx(value, rel=2e-3, abs=1e-5), part
@@ -231,7 +231,7 @@ def test_who_learns_from_what():
     @jax.jit
     def gradients(params: Any) -> dict[str, Any]:
         def part(params: Any, name: str) -> jax.Array:
-            arguments = case.state.target, case.tokens, case.representation, jax.random.key(0)
+            arguments = case.state.target, case.tokens, case.representation, case.state.updates, jax.random.key(0)
             return case.sac.loss(params, *arguments)[1][name]
 
         return {name: jax.grad(part)(params, name) for name in ("loss/actor", "loss/td", "loss/f", "loss/auxiliary")}
@@ -328,6 +328,8 @@ def test_titles_follow_the_algorithm():
     ({"demonstrations": 3}, "--sac.demonstrations: got 3, accepted: 0, as shapes has no expert"),
     ({"rotated_copies": 4}, "--sac.rotated-copies: got 4, accepted: 0, as shapes cannot show a moment again"),
     ({"updates_per_step": 0.05}, "--sac.updates-per-step: got 0.05"),
+    ({"imitation_weight": 1.0}, "--sac.imitation-weight: got 1.0, accepted: 0, unless there are --sac.demonstrations"),
+    ({"pretrain_updates": 9}, "--sac.pretrain-updates: got 9, accepted: 0, unless there are --sac.demonstrations"),
     ({"batch_episodes": 7}, "--sac.batch-episodes: got 7, accepted: an even number"),
     ({"initial_temperature": 0.0}, "--sac.initial-temperature: got 0.0, accepted: a number > 0"),
 ])
@@ -433,10 +435,11 @@ def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
     ("ua", "psi"), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (
         ("ua", "shared"), ("believer", "shared"), ("believer", "psi"), ("base", "psi"), ("mdp", "shared")))])
 def test_every_agent_runs_in_the_loop(agent: str, trunk: Any):
-    run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", sac=dataclasses.replace(LOOP.sac, trunk=trunk),
+    sac = dataclasses.replace(LOOP.sac, trunk=trunk, pretrain_updates=3, imitation_weight=1.0)
+    run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", sac=sac,
                                   stage1=Stage1Config(features=FEATURES, episodes=4)))
     state, metrics = run.chunk(run.start())
-    assert int(state.agent.updates) == 12
+    assert int(state.agent.updates) == 3 + 12
     assert all(np.isfinite(x) for name, x in jax.device_get(metrics).items() if name.startswith(("loss/", "actor/")))
     results = jax.device_get(run.evaluate(state, jax.random.key(0), 3))
     assert (results["length"] == Compass.choice + 1).all()

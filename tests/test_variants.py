@@ -87,7 +87,8 @@ class Agent:
 
     def losses(self) -> tuple[float, dict[str, float]]:
         loss, metrics = jax.jit(self.dqn.loss)(
-            self.state.params, self.state.target, self.tokens, self.representation, jax.random.key(0))
+            self.state.params, self.state.target, self.tokens, self.representation, self.state.updates,
+            jax.random.key(0))
         return float(loss), {name: float(value) for name, value in metrics.items()}
 
 
@@ -219,7 +220,7 @@ def test_the_mdp_agent_acts_on_frozen_features_or_on_the_state(sees: Any):
     assert same == (sees != "state")
 
     def loss(params: Any) -> jax.Array:
-        return agent.dqn.loss(params, init.target, agent.tokens, None, jax.random.key(0))[0]
+        return agent.dqn.loss(params, init.target, agent.tokens, None, init.updates, jax.random.key(0))[0]
 
     grads = jax.jit(jax.grad(loss))(init.params)["agent"]
     assert any(np.any(x) for x in jax.tree.leaves(grads["phi"])) == (sees == "state")

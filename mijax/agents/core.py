@@ -117,9 +117,10 @@ class Agent(abc.ABC):
 
     @abc.abstractmethod
     def loss(
-        self, params: Params, target: Params, tokens: Tokens, representation: Representation | None, key: jax.Array
+        self, params: Params, target: Params, tokens: Tokens, representation: Representation | None, updates: jax.Array,
+        key: jax.Array,
     ) -> tuple[jax.Array, Metrics]:
-        """The sum of all losses; () and its parts."""
+        """The sum of all losses after so many updates; () and its parts."""
 
     @abc.abstractmethod
     def heads(self, agent: Params, tokens: Tokens, key: jax.Array) -> Sequence[Heads]:
@@ -189,7 +190,7 @@ class Agent(abc.ABC):
     ) -> tuple[AgentState, Metrics]:
         """One gradient step, then one soft step of the target network."""
         (_, metrics), grads = jax.value_and_grad(self.loss, has_aux=True)(
-            state.params, state.target, tokens, representation, key
+            state.params, state.target, tokens, representation, state.updates, key
         )
         steps, optimizer = self.optimizer.update(grads, state.optimizer, state.params)
         params = cast(Params, optax.apply_updates(state.params, steps))
@@ -298,6 +299,6 @@ def episode_mean(x: jax.Array, valid: jax.Array, tokens: Tokens) -> jax.Array:
 
 def adam(config: Config, options: DQNConfig | SACConfig) -> optax.GradientTransformation:
     """Adam, whose step size falls linearly over the run."""
-    updates = max(1, round(config.steps * options.updates_per_step))
-    rate = optax.linear_schedule(options.learning_rate, options.learning_rate * options.final_learning_rate, updates)
+    rate = optax.linear_schedule(
+        options.learning_rate, options.learning_rate * options.final_learning_rate, options.updates_in(config.steps))
     return optax.adam(rate)

@@ -106,9 +106,11 @@ class DQN(Agent):
         return memory, jnp.where(jax.random.uniform(key_gate, greedy.shape) < epsilon, random, greedy)
 
     def loss(
-        self, params: Params, target: Params, tokens: Tokens, representation: Representation | None, key: jax.Array
+        self, params: Params, target: Params, tokens: Tokens, representation: Representation | None, updates: jax.Array,
+        key: jax.Array,
     ) -> tuple[jax.Array, Metrics]:
         """The sum of the TD losses, the weighted auxiliary losses and f's own loss; () and its parts."""
+        del updates
         key_agent, key_f = jax.random.split(key)
         tokens = self.labelled(tokens, representation)
         online: Outputs = self._apply(self.network, params["agent"], tokens, key_agent)

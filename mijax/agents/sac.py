@@ -57,6 +57,12 @@ class SAC(Agent):
         """In nats, of all dimensions."""
         return self.options.target_entropy * self.network.action_size
 
+    def imitation_weight(self, updates: jax.Array) -> jax.Array:
+        """() weight of the demonstrations' actions after so many updates: it falls linearly to 0."""
+        options = self.options
+        last = options.imitation_until * options.updates_in(self.config.steps)
+        return options.imitation_weight * jnp.clip(1 - updates.astype(jnp.float32) / max(last, 1.0), 0.0, 1.0)
+
     def init_network(self, key: jax.Array) -> Params:
         """Fresh parameters of the network."""
         return self.network.init(key, self.example_tokens())["params"]
@@ -154,7 +160,8 @@ class SAC(Agent):
         return cast(Tokens, self._call("look", agent, tokens))
 
     def loss(
-        self, params: Params, target: Params, tokens: Tokens, representation: Representation | None, key: jax.Array
+        self, params: Params, target: Params, tokens: Tokens, representation: Representation | None, updates: jax.Array,
+        key: jax.Array,
     ) -> tuple[jax.Array, Metrics]:
         """The losses of critics, actor and temperature, the weighted auxiliary losses and f's; () and its parts."""
         key_agent, key_f, key_action, key_next = jax.random.split(key, 4)
@@ -174,7 +181,7 @@ class SAC(Agent):
         loss, metrics = loss + loss_actor, metrics | parts
         if tokens.demonstrated is not None:
             loss_imitation = self._imitation(agent, online, tokens)
-            loss += self.options.imitation_weight * loss_imitation
+            loss += self.imitation_weight(updates) * loss_imitation
             metrics |= {"loss/imitation": loss_imitation}
         next_action, next_log_prob = self._draw(agent, steady.actor, key_next)
         q_next = jnp.min(self._call("values", target, averaged.critic, next_action), axis=0)

@@ -36,7 +36,8 @@ def paper(config: Config, vector_observation: bool) -> Config:
         epsilon_steps=steps // 10, value_bound=0.0)
     sac = dataclasses.replace(
         config.sac, learning_rate=3e-4, final_learning_rate=1.0, discount=0.99, trace_decay=0.0, target_rate=0.005,
-        batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0)
+        batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0,
+        pretrain_updates=0, imitation_weight=0.0)
     information = dataclasses.replace(
         config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(config.domain, 10.0),
         intrinsic_form="cosine")

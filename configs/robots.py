@@ -3,8 +3,10 @@
 The budget is the paper's: 800 episodes of 50 steps, 80 demonstrations of the scripted expert in the replay from the
 start, every episode sampled as it was or in one of four turned copies. Updates are cheap: frames are looked at once, by
 psi's body, for every agent alike (six times the speed, results/robots), there is half an update for each step with
-returns that reach further back, and no dropout, so that one pass serves gradients and targets. Stage 1 sees copies of
-each demonstrated transition as Table 3 has them, for a budget of minutes.
+returns that reach further back, and no dropout, so that one pass serves gradients and targets. Every agent begins on the
+demonstrations alone and imitates them for half of the run: without, none learns to change over, as the critics tell a
+demonstration by its history and not by its actions (results/robots). Stage 1 sees copies of each demonstrated transition
+as Table 3 has them, for a budget of minutes.
 """
 
 from mijax.config import (
@@ -35,7 +37,8 @@ def robot(domain: str, copies: int, epochs: int) -> Config:
                             lambda_club=0.3, club_ramp=0.8, lambda_dim_s=0.1, lambda_dim_o=1.0, phi_shrinkage=0.0),
         network=NetworkConfig(action_embedding=16, observation_embedding=64, dropout=0.0),
         sac=SACConfig(trunk="psi", learning_rate=1e-3, final_learning_rate=0.05, trace_decay=0.8, target_rate=0.01,
-                      updates_per_step=0.5, demonstrations=80, rotated_copies=4),
+                      updates_per_step=0.5, demonstrations=80, demonstration_share=0.25, pretrain_updates=2000,
+                      imitation_weight=2.0, imitation_until=0.5, rotated_copies=4),
         zp=SelfPredictionConfig(weight=0.1),
         information=InformationConfig(auxiliary_weight=0.5, intrinsic_weight=0.1, intrinsic_form="cosine"),
         evaluation=EvaluationConfig(every=500, episodes=10),

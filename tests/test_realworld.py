@@ -233,8 +233,9 @@ def test_a_run_from_the_command_line(tmp_path: pathlib.Path, capsys: pytest.Capt
     run = tmp_path / "run"
     assert train.main([
         "--domain", "block_pulling", "--agent", "base", "--steps", "100", "--sac.demonstrations", "2",
-        "--sac.replay-steps", "2000", "--sac.batch-episodes", "2", "--evaluation.every", "100",
-        "--evaluation.episodes", "2", "--out", str(run)]) == 0
+        "--sac.replay-steps", "2000", "--sac.batch-episodes", "2", "--sac.pretrain-updates", "2",
+        "--stage1.episodes", "20", "--stage1.heldout-episodes", "10", "--stage1.epochs", "1",
+        "--stage1.batch-size", "50", "--evaluation.every", "100", "--evaluation.episodes", "2", "--out", str(run)]) == 0
     capsys.readouterr()
     assert transfer.main([str(run), "--episodes", "2", "--gap", "hard", "--gif"]) == 0
     said = capsys.readouterr().out

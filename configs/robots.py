@@ -3,10 +3,10 @@
 The budget is the paper's: 800 episodes of 50 steps, 80 demonstrations of the scripted expert in the replay from the
 start, every episode sampled as it was or in one of four turned copies. Updates are cheap: frames are looked at once, by
 psi's body, for every agent alike (six times the speed, results/robots), there is half an update for each step with
-returns that reach further back, and no dropout, so that one pass serves gradients and targets. Every agent begins on the
-demonstrations alone and imitates them for half of the run: without, none learns to change over, as the critics tell a
-demonstration by its history and not by its actions (results/robots). Stage 1 sees copies of each demonstrated transition
-as Table 3 has them, for a budget of minutes.
+returns that reach further back, and no dropout, so that one pass serves gradients and targets. Every agent begins on
+the demonstrations alone and imitates them for half of the run: without, none learns to change over, as the critics tell
+a demonstration by its history and not by its actions (results/robots). Stage 1 sees copies of each demonstrated
+transition as Table 3 has them, for a budget of minutes.
 """
 
 from mijax.config import (

@@ -31,8 +31,8 @@ from launch.arithmetic import operations
 from mijax import runtime
 from mijax.agents.dqn import AgentState
 from mijax.agents.variants import VARIANTS
-from mijax.config import Config
-from mijax.learner import Learner, make_learner
+from mijax.config import Config, TrunkKind
+from mijax.learner import Learner, LearnerState, make_learner
 from mijax.nets.encoders import encoder_for
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices
 from mijax.replay import Replay, StepRecord, sample_episodes
@@ -225,6 +225,26 @@ def bench_stage2(bench: Bench, env: Environment) -> Iterator[Result]:
     yield from _updates(bench, env, "stage 2, paper's sizes", paper_sizes(env))
 
 
+def bench_sac(bench: Bench, env: Environment) -> Iterator[Result]:
+    """The preset's SAC updates from a replay of the expert's episodes, by how frames are encoded."""
+    trunks: Sequence[TrunkKind] = ("psi", "shared")
+    for trunk in trunks:
+        preset = configs.preset(env.name)
+        sac = dataclasses.replace(
+            preset.sac, trunk=trunk, pretrain_updates=0, demonstrations=min(80, bench.sizes.replay_episodes),
+            batch_episodes=bench.sizes.batch_episodes or preset.sac.batch_episodes)
+        learner, _, representation = fresh_learner(env, dataclasses.replace(preset, sac=sac), bench.sizes)
+        state = jax.jit(learner.init)(jax.random.key(0), representation)
+        keys = jax.random.split(jax.random.key(3), bench.sizes.updates)
+
+        def run(state: LearnerState, learner: Learner = learner, keys: jax.Array = keys) -> tuple[AgentState, Metrics]:
+            return jax.lax.scan(
+                lambda agent, key: learner.update(agent, state.replay, state.representation, key), state.agent, keys)
+
+        yield bench.measure(env.name, f"stage 2, trunk {trunk}", "updates", len(keys), 1, run, state,
+                            detail=f"{sac.batch_episodes} episodes of the expert")
+
+
 def bench_agents(bench: Bench, env: Environment) -> Iterator[Result]:
     """Updates of every agent with every memory at the paper's sizes, episodes that last to the horizon."""
     for agent, declaration in VARIANTS.items():
@@ -372,11 +392,11 @@ def show(results: Sequence[Result], console: Console) -> None:
     console.print(table)
 
 
-ROBOT_PARTS = ("environments", "stage1")
-"""What there is to measure on a robot task."""
 PARTS: dict[str, Callable[[Bench, Environment], Iterator[Result]]] = {
     "environments": bench_environments, "acting": bench_acting, "stage1": bench_stage1, "stage2": bench_stage2,
     "agents": bench_agents, "seeds": bench_seeds}
+ROBOT_PARTS = {"environments": bench_robot, "stage1": bench_stage1, "stage2": bench_sac}
+"""What there is to measure on a robot task."""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -399,10 +419,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bench = Bench(QUICK if options.quick else Sizes())
     results = [bench.matmul()]
     for domain in options.domains:
-        robot = domain in configs.ROBOTS
-        for part in (part for part in (ROBOT_PARTS if robot else PARTS) if part in options.only):
-            function = bench_robot if robot and part == "environments" else PARTS[part]
-            results.extend(function(bench, registry.make(domain)))
+        parts = ROBOT_PARTS if domain in configs.ROBOTS else PARTS
+        for part in (part for part in parts if part in options.only):
+            results.extend(parts[part](bench, registry.make(domain)))
     if options.json:
         print(json.dumps({"matmul_gflops": bench.matmul_gflops, "results": [vars(r) for r in results]}, indent=2))
     else:

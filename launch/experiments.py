@@ -10,6 +10,7 @@ from mijax.figures import display_name
 from mijax.results import AGENT_COLOURS
 
 GRID_WORLDS = ("heaven_hell", "sphinx", "carflag_2d")
+DOMAINS = GRID_WORLDS + configs.ROBOTS
 BONUS_WEIGHT = 0.5
 """Of the intrinsic reward where a domain's preset has none but the experiment is about it."""
 _BELIEVER = stage1_of(Config(agent="believer"))
@@ -29,7 +30,7 @@ class Arm:
     colour: str
     options: tuple[str, ...]
     features: str | None = None
-    """The shared stage 1: `ours` or `believer`; None where the agent has none, or one of its own."""
+    """The shared stage 1: `ours` or `believer`; None where the agent has none of its own, or Believer's own."""
 
 
 MI = Arm("mi", "Ours", AGENT_COLOURS["mi"], ("--agent", "mi"), "ours")
@@ -94,6 +95,20 @@ def ablations(domain: str) -> dict[str, tuple[Arm, ...]]:
     return {display_name(domain): arms}
 
 
+def parts(domain: str) -> dict[str, tuple[Arm, ...]]:
+    """Not in the paper: ours on a robot with one part left out at a time."""
+    def without(name: str, label: str, colour: str, *options: str) -> Arm:
+        return Arm(f"mi-no-{name}", f"without {label}", colour, (*MI.options, *options), "ours")
+
+    return {display_name(domain): (
+        MI,
+        without("augmentation", "turned copies", "#E69F00", "--sac.rotated-copies", "0"),
+        without("auxiliary", "auxiliary task", "#009E73", "--information.auxiliary-weight", "0"),
+        without("intrinsic", "intrinsic reward", "#CC79A7", "--information.intrinsic-weight", "0"),
+        without("psi", "psi", "#555555", "--sac.trunk", "shared", "--information.no-start-from-psi"),
+        without("imitation", "imitation", "#D55E00", "--sac.pretrain-updates", "0", "--sac.imitation-weight", "0"))}
+
+
 @dataclasses.dataclass(frozen=True)
 class Experiment:
     """A figure of the paper."""
@@ -106,14 +121,15 @@ class Experiment:
 
 EXPERIMENTS = {
     "fig4": Experiment("Overlap test (Fig. 4)", ("heaven_hell",), overlap),
-    "fig3": Experiment("All agents (Fig. 3)", GRID_WORLDS, agents),
+    "fig3": Experiment("All agents (Fig. 3)", DOMAINS, agents),
     "fig32": Experiment("Intrinsic reward within an episode (Fig. 32)", GRID_WORLDS,
                         lambda domain: {display_name(domain): (informed(domain),)}),
     "fig6": Experiment("Intrinsic reward and auxiliary task (Fig. 6)", ("sphinx", "carflag_2d"), ablations),
     "fig5": Experiment("GPT against GRU (Fig. 5)", ("heaven_hell", "sphinx"), memories),
-    "fig29": Experiment("Learning on features (Fig. 29)", GRID_WORLDS, features),
-    "fig31": Experiment("GPT against GRU (Fig. 31)", GRID_WORLDS, memories),
-    "fig30": Experiment("Intrinsic reward and auxiliary task (Fig. 30)", GRID_WORLDS, ablations),
+    "fig29": Experiment("Learning on features (Fig. 29)", DOMAINS, features),
+    "fig31": Experiment("GPT against GRU (Fig. 31)", DOMAINS, memories),
+    "fig30": Experiment("Intrinsic reward and auxiliary task (Fig. 30)", DOMAINS, ablations),
+    "parts": Experiment("What each part is worth", ("block_pulling",), parts),
 }
 """In the order of `all`, information per minute: the memoryless agents are cheap and tell whether the features are
 right; Figs. 29 to 31 mostly draw what is there already. Within it, cheap domains come first."""

@@ -24,9 +24,10 @@ import numpy as np
 
 from configs.paper import STEPS
 from envs_mjx import registry
-from launch.experiments import EXPERIMENTS, GRID_WORLDS, Arm
+from launch.experiments import DOMAINS, EXPERIMENTS, Arm
 from mijax import episode, evaluate, figures, runtime, stage1, tables, train
-from mijax.config import ConfigError, Stage1Config, config_from_dict, parse_seeds, require
+from mijax.agents.variants import needs_representation, stage1_of
+from mijax.config import Config, ConfigError, Stage1Config, config_from_dict, parse_seeds, require
 from mijax.learner import make_learner
 from mijax.metrics import RunError, RunFolder
 from mijax.representation.dataset import collect
@@ -82,7 +83,8 @@ def run_arm(request: Request, domain: str, arm: Arm) -> list[RunFolder]:
             finish(train.parse(("--resume", str(run.path))))
     missing = [seed for seed in request.seeds if not any(seed in run.config()["seed_list"] for run in runs)]
     if missing:
-        source = None if arm.features is None else shared_features(request, domain, arm, options)
+        features = features_of(arm, options.config)
+        source = None if features is None else shared_features(request, domain, features, options)
         runs.append(finish(dataclasses.replace(
             options, seeds=",".join(map(str, missing)) + ",", representation=source,
             out=place / f"seeds_{'_'.join(map(str, missing))}")))
@@ -120,9 +122,15 @@ def _flat(values: dict, prefix: str = "") -> dict:
     return flat
 
 
-def shared_features(request: Request, domain: str, arm: Arm, options: train.TrainOptions) -> pathlib.Path:
-    """The run of stage 1 that an arm takes its features from, with every seed that was asked for."""
-    config, path = options.config, request.out / "runs" / domain.replace(":", ".") / f"features-{arm.features}"
+def features_of(arm: Arm, config: Config) -> str | None:
+    """The shared stage 1 that an arm takes its features from; ours, too, where it only looks through psi."""
+    looks = needs_representation(config) and stage1_of(config) == config.stage1
+    return arm.features or ("ours" if looks else None)
+
+
+def shared_features(request: Request, domain: str, features: str, options: train.TrainOptions) -> pathlib.Path:
+    """The run of that stage 1, with every seed that was asked for."""
+    config, path = options.config, request.out / "runs" / domain.replace(":", ".") / f"features-{features}"
     if (path / "config.json").exists():
         run = RunFolder.open(path)
         if Stage1Config(**run.config()["stage1"]) != config.stage1:
@@ -160,10 +168,10 @@ def note_on(request: Request, domains: Sequence[str], steps: dict[str, int]) -> 
 
 
 def stage1_samples(request: Request, domain: str, arm: Arm) -> int:
-    """Environment steps of the random policy that an arm's features were trained on."""
-    if arm.features is None and "believer" not in arm.options:
-        return 0
+    """Environment steps of the random policy that an arm's features were trained on: none where an expert acted."""
     config = request.parse(domain, arm).config
+    if config.stage1.data == "demonstrations" or (arm.features is None and "believer" not in arm.options):
+        return 0
     key = jax.random.split(stage1.representation_key(request.seeds[0]), 3)[0]
     return collect(registry.make(domain), key, config.stage1.episodes).size
 
@@ -260,9 +268,9 @@ def plan(what: str, domain: str | None) -> list[tuple[str, tuple[str, ...]]]:
         return [(name, d) for name, d in chosen if what != "all" or domain in EXPERIMENTS[name].domains]
     if what != "all":
         return [(what, EXPERIMENTS[what].domains)]
-    return [(name, tuple(d for d in GRID_WORLDS[:number] if d in EXPERIMENTS[name].domains))
-            for number in range(1, len(GRID_WORLDS) + 1) for name in names
-            if GRID_WORLDS[number - 1] in EXPERIMENTS[name].domains]
+    return [(name, tuple(d for d in DOMAINS[:number] if d in EXPERIMENTS[name].domains))
+            for number in range(1, len(DOMAINS) + 1) for name in names
+            if DOMAINS[number - 1] in EXPERIMENTS[name].domains]
 
 
 def arm_names(what: str, domain: str | None) -> list[str]:

@@ -50,8 +50,9 @@ def test_quick_bench_reports_every_part_as_json(domain, capsys, monkeypatch):
 @pytest.mark.slow  # two processes compile the environment
 @pytest.mark.lenient
 def test_quick_bench_of_a_robot(capsys):
-    assert bench.main(["--json", "--quick", "--only", "environments", "--domains", "block_pulling"]) == 0
-    _, environment, physics, moments = json.loads(capsys.readouterr().out)["results"]
+    assert bench.main(["--json", "--quick", "--only", "environments", "stage2", "--domains", "block_pulling"]) == 0
+    _, environment, physics, moments, *updates = json.loads(capsys.readouterr().out)["results"]
     assert environment["what"].startswith("environment, batch ")
-    assert min(result["per_second"] for result in (environment, physics, moments)) > 0
+    assert min(result["per_second"] for result in (environment, physics, moments, *updates)) > 0
     assert "second process" in environment["detail"]
+    assert [update["what"] for update in updates] == ["stage 2, trunk psi", "stage 2, trunk shared"]

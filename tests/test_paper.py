@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from launch import paper
-from launch.experiments import AGENTS, EXPERIMENTS, GRID_WORLDS, ablations, memories, overlap
+from launch.experiments import AGENTS, DOMAINS, EXPERIMENTS, ablations, memories, overlap, parts
 from mijax import tables
 from mijax.metrics import RunFolder
 from mijax.results import ReportedRun
@@ -22,13 +22,13 @@ pytestmark = pytest.mark.lenient
 
 
 def test_every_figure_is_planned_cheap_domains_first() -> None:
-    assert set(EXPERIMENTS) == {"fig3", "fig4", "fig5", "fig6", "fig29", "fig30", "fig31", "fig32"}
+    assert set(EXPERIMENTS) == {"fig3", "fig4", "fig5", "fig6", "fig29", "fig30", "fig31", "fig32", "parts"}
     assert [arm.options[1] for arm in AGENTS] == ["mi", "base", "zp", "ba", "ua", "believer"]
-    assert paper.plan("fig3", None) == [("fig3", GRID_WORLDS)]
+    assert paper.plan("fig3", None) == [("fig3", DOMAINS)]
     assert paper.plan("fig3", "sphinx") == [("fig3", ("sphinx",))]
     everything = paper.plan("all", None)
     assert {name for name, _ in everything} == set(EXPERIMENTS)
-    last_domains = [GRID_WORLDS.index(domains[-1]) for _, domains in everything]
+    last_domains = [DOMAINS.index(domains[-1]) for _, domains in everything]
     assert last_domains == sorted(last_domains)
     assert "fig4" not in {name for name, _ in paper.plan("all", "sphinx")}
 
@@ -45,6 +45,18 @@ def test_experiments_share_their_runs() -> None:
     ours, believers = overlap("heaven_hell").values()
     assert ours[2] == believers[2]  # the raw state has nothing to do with features
     assert {arm.features for arm in believers} == {"believer", None}
+
+
+def test_who_looks_through_whose_features() -> None:
+    """On robots every agent looks through psi's body; Believer's is its own."""
+    request = paper.Request(pathlib.Path("nowhere"), None, (0,), None, ())
+    robots, grid = ([paper.features_of(arm, request.parse(domain, arm).config) for arm in AGENTS]
+                    for domain in ("block_pulling", "heaven_hell"))
+    assert robots == ["ours"] * 5 + [None]
+    assert grid == ["ours"] + [None] * 5
+    (whole, *fewer), = parts("block_pulling").values()
+    trained = [request.parse("block_pulling", arm).config for arm in (whole, *fewer)]
+    assert len({str(config) for config in trained}) == len(trained) == 6
 
 
 def command(out: pathlib.Path) -> list[str]:

@@ -5,4 +5,4 @@
 
 from configs.robots import robot
 
-CONFIG = robot("block_pulling", copies=4, epochs=40)
+CONFIG = robot("block_pulling", copies=4, epochs=20)

@@ -5,4 +5,4 @@
 
 from configs.robots import robot
 
-CONFIG = robot("block_pushing", copies=12, epochs=16)
+CONFIG = robot("block_pushing", copies=12, epochs=12, lambda_club=0.1)

@@ -5,4 +5,4 @@
 
 from configs.robots import robot
 
-CONFIG = robot("drawer_opening", copies=6, epochs=28)
+CONFIG = robot("drawer_opening", copies=6, epochs=14)

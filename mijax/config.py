@@ -94,6 +94,8 @@ class Stage1Config:
                           "lambda_dim_o", "lambda_kl", "rewarded", "phi_shrinkage", "copies")
         require(self.copies == 0 or self.data == "demonstrations", "stage1.copies", self.copies,
                 "0, unless --stage1.data is demonstrations")
+        require(self.heldout_episodes >= 2, "stage1.heldout-episodes", self.heldout_episodes,
+                "at least 2: probes are fitted on one half and scored on the other")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
         require(0 <= self.club_ramp <= 1, "stage1.club-ramp", self.club_ramp, "a number in [0, 1]")
 
@@ -130,7 +132,7 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         _require_at_least("network.", self, 1, "layers", "heads", "gru_width", "action_embedding",
                           "observation_embedding")
-        require(0 <= self.dropout < 1, "network.dropout", self.dropout, "a number in [0, 1)")
+        require(0 <= self.dropout <= 0.9, "network.dropout", self.dropout, "a number in [0, 0.9]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +225,9 @@ class SACConfig:
     imitation_weight: float = 0.0
     """Weight of the squared distance between the actor's mean action and a demonstration's (paper: 0)."""
     imitation_until: float = 1.0
-    """Fraction of the run's updates after which that weight has fallen linearly to 0."""
+    """Fraction of the run's updates over which that weight falls linearly ..."""
+    imitation_final: float = 0.0
+    """... to this fraction of itself, which stays."""
     rotated_copies: int = 0
     """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
     original (paper: 4 on the robots)."""
@@ -244,10 +248,10 @@ class SACConfig:
             require(getattr(self, name) > 0, f"sac.{name}".replace("_", "-"), getattr(self, name), "a number > 0")
         require(self.batch_episodes % 2 == 0, "sac.batch-episodes", self.batch_episodes, "an even number")
         for name in ("discount", "trace_decay", "target_rate", "final_learning_rate", "demonstration_share",
-                     "imitation_until"):
+                     "imitation_until", "imitation_final"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"sac.{name}".replace("_", "-"), value, "a number in [0, 1]")
-        for name in ("pretrain_updates", "imitation_weight"):
+        for name in ("demonstration_share", "pretrain_updates", "imitation_weight"):
             value = getattr(self, name)
             require(self.demonstrations > 0 or value == 0, f"sac.{name}".replace("_", "-"), value,
                     "0, unless there are --sac.demonstrations")

@@ -92,6 +92,17 @@ def test_every_shape_has_an_encoder_and_its_first_block_leads_to_it(shape):
     np.testing.assert_allclose(evaluate(encoder, params, x[None]), z[None], atol=1e-6)
 
 
+def test_contrast_hides_the_level_of_an_image():
+    shape = (52, 52, 2)
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(2, *shape)), jnp.float32)
+    plain, relative = encoder_for(ArraySpec(shape), 8), encoder_for(ArraySpec(shape, contrast=0.05), 8)
+    params = plain.init(jax.random.key(0), x)["params"]
+    seen = evaluate(relative, params, x)
+    np.testing.assert_allclose(evaluate(relative, params, x + 0.3), seen, rtol=1e-3, atol=1e-3)
+    by_hand = (np.asarray(x) - np.asarray(x[..., 0]).mean((1, 2))[:, None, None, None]) / 0.05
+    np.testing.assert_allclose(evaluate(plain, params, jnp.asarray(by_hand)), seen, rtol=1e-3, atol=1e-3)
+
+
 def test_papers_networks_are_chosen_by_size():
     assert [(b.channels, b.kernel, b.pool) for b in image_plan(6)] == [(64, 2, 1), (128, 2, 2), (256, 2, 1)]
     assert [(b.channels, b.kernel, b.pool) for b in image_plan(11)] == [(64, 2, 2), (128, 2, 2), (256, 2, 1)]

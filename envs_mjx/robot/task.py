@@ -27,6 +27,9 @@ OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limi
 """What `RobotState.outcome` counts."""
 RUNNING, SUCCESS, LEFT, NOT_FINITE, TIME_LIMIT = range(5)
 
+CONTRAST = 0.05
+"""Metres: the height of an object, against depths that shift by four times as much when the gripper rises. The fingers,
+painted 0, still tell how high it is."""
 DEEPEST = float(scene.WORKSPACE_HIGH[2]) + depth.CAMERA_ABOVE_GRIPPER
 """Metres: the depth of the table at the gripper's highest. A policy is to see no more than that, give or take three
 times the paper's noise."""
@@ -58,8 +61,8 @@ class RobotTask(Environment):
 
     horizon = 50
     action_spec = ContinuousActions(4, ("x", "y", "z", "turn"))
-    observation_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32, blank=1)
-    state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32)
+    observation_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32, blank=1, contrast=CONTRAST)
+    state_spec = ArraySpec((depth.SIZE, depth.SIZE, 2), np.float32, contrast=CONTRAST)
     interface = Interface(
         observation="channel 0: depth below a camera 6 cm above the gripper, 0 where a finger is; channel 1: zeros. "
                     "The window is 0.4 m x 0.4 m, the gripper where pixels 41 and 42 meet",

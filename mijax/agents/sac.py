@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from envs_mjx.base import ArraySpec, ContinuousActions, Environment
 from mijax.agents.core import Agent, Heads, adam, episode_mean, transitions
@@ -58,10 +59,11 @@ class SAC(Agent):
         return self.options.target_entropy * self.network.action_size
 
     def imitation_weight(self, updates: jax.Array) -> jax.Array:
-        """() weight of the demonstrations' actions after so many updates: it falls linearly to 0."""
+        """() weight of the demonstrations' actions after so many updates."""
         options = self.options
-        last = options.imitation_until * options.updates_in(self.config.steps)
-        return options.imitation_weight * jnp.clip(1 - updates.astype(jnp.float32) / max(last, 1.0), 0.0, 1.0)
+        fade = optax.linear_schedule(options.imitation_weight, options.imitation_weight * options.imitation_final,
+                                     max(1, round(options.imitation_until * options.updates_in(self.config.steps))))
+        return jnp.asarray(fade(updates), jnp.float32)
 
     def init_network(self, key: jax.Array) -> Params:
         """Fresh parameters of the network."""
@@ -196,11 +198,6 @@ class SAC(Agent):
     def heads(self, agent: Params, tokens: Tokens, key: jax.Array) -> Sequence[Heads]:
         """Of the actor's and the critics' branches, or of the one they share."""
         return self._encode(agent, self.look(agent, tokens), key).heads
-
-    @property
-    def _exact(self) -> bool:
-        """Whether gradient passes draw nothing: neither dropout nor Believer's latents."""
-        return self.config.network.dropout == 0 and not self.declaration.believes
 
     def _call(self, method: str, params: Params, *arguments: Any) -> Any:
         return self.network.apply({"params": params}, *arguments, method=method)

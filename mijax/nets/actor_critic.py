@@ -31,11 +31,6 @@ def shown(frames: jax.Array, spec: ArraySpec) -> jax.Array:
     return frames[..., : spec.shape[-1] - spec.blank] if spec.blank else frames
 
 
-def shown_spec(spec: ArraySpec) -> ArraySpec:
-    """What is left of a spec without those channels."""
-    return ArraySpec((*spec.shape[:-1], spec.shape[-1] - spec.blank), spec.dtype) if spec.blank else spec
-
-
 @struct.dataclass
 class BranchHeads:
     """What one memory branch says beside its values: see `mijax.agents.core.Heads`."""

@@ -127,6 +127,7 @@ class ImageEncoder(nn.Module):
     features: int
     dtype: jnp.dtype = jnp.float32
     channels: int | None = None  # of the images; of these the last may be left out where they are always 0
+    contrast: float = 0.0  # see `ArraySpec`
 
     def setup(self) -> None:
         inputs = (self.channels, *(None for _ in self.plan[1:]))
@@ -146,6 +147,9 @@ class ImageEncoder(nn.Module):
 
     def first_block(self, x: Frames) -> Frames:
         """(..., rows, columns, channels) -> (..., rows', columns', channels'): what the discriminator shares."""
+        if self.contrast > 0:
+            assert isinstance(x, jax.Array)
+            x = (x - jnp.mean(x[..., :1], axis=(-3, -2, -1), keepdims=True)) / self.contrast
         return self._block(0, x)
 
     def finish(self, h: Frames) -> jax.Array:
@@ -194,7 +198,7 @@ def _fits(plan: Sequence[ConvBlock], size: int) -> bool:
 def encoder_for(spec: ArraySpec, features: int, dtype: jnp.dtype = jnp.float32) -> Encoder:
     """The encoder of arrays like `spec`: vectors (D,) or images (rows, columns, channels)."""
     if spec.is_image:
-        return ImageEncoder(image_plan(min(spec.shape[:2])), features, dtype, spec.shape[2])
+        return ImageEncoder(image_plan(min(spec.shape[:2])), features, dtype, spec.shape[2], spec.contrast)
     if len(spec.shape) == 1:
         return VectorEncoder(hidden=VECTOR_HIDDEN, features=features, dtype=dtype)
     raise ValueError(f"no encoder for arrays of shape {spec.shape}: vectors (D,) and images (rows, columns, channels)")

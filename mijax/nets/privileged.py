@@ -1,5 +1,6 @@
 """The memoryless agent that sees the state: what can be done with z_s, z_s + z_o, or s (paper Fig. 4, Fig. 29)."""
 
+import dataclasses
 from typing import Any
 
 import flax.linen as nn
@@ -25,8 +26,8 @@ class StateShown(Environment):
         self._env = env
         self.name, self.horizon, self.action_spec = env.name, env.horizon, env.action_spec
         self.state_spec, self.variables = state, env.variables
-        self.observation_spec = ArraySpec(
-            (*state.shape[:-1], state.shape[-1] + observation.shape[-1]), state.dtype, observation.blank)
+        self.observation_spec = dataclasses.replace(
+            observation, shape=(*state.shape[:-1], state.shape[-1] + observation.shape[-1]))
 
     def reset(self, key: jax.Array) -> tuple[EnvState, TimeStep]:
         """As the environment does."""
@@ -77,7 +78,7 @@ class PrivilegedFeatures(nn.Module):
     def setup(self) -> None:
         self.phi = encoder_for(self.state_spec, self.features)
         own = (*self.observation_spec.shape[:-1], self.observation_spec.shape[-1] - self.state_spec.shape[-1])
-        self.psi = encoder_for(ArraySpec(own, self.observation_spec.dtype), self.features)
+        self.psi = encoder_for(dataclasses.replace(self.observation_spec, shape=own), self.features)
 
     def see(self, both: jax.Array) -> jax.Array:
         """(N, *observation_shape) -> (N, F) or (N, 2 F)"""

@@ -32,6 +32,7 @@ def save_representation(representation: Representation, env: Environment, folder
         "features": int(representation.z_s_mean.shape[-1]),
         "state_shape": list(env.state_spec.shape),
         "observation_shape": list(env.observation_spec.shape),
+        "contrast": _contrast(env),
     }
     write_atomically(folder / PARAMETERS_FILE, serialization.to_bytes(jax.device_get(representation)))
     write_atomically(folder / FACTS_FILE, json.dumps(facts, indent=2).encode())
@@ -56,7 +57,8 @@ def load_representation(path: str | os.PathLike[str], env: Environment) -> Repre
     folder = pathlib.Path(path)
     facts = _read_facts(folder)
     expected = {"domain": env.name, "state_shape": list(env.state_spec.shape),
-                "observation_shape": list(env.observation_spec.shape)}
+                "observation_shape": list(env.observation_spec.shape), "contrast": _contrast(env)}
+    facts.setdefault("contrast", [0.0, 0.0])
     for name, value in expected.items():
         if facts.get(name) != value:
             raise RepresentationError(f"{folder}: its {name} is {facts.get(name)}, this run's is {value}")
@@ -71,6 +73,10 @@ def load_representation(path: str | os.PathLike[str], env: Environment) -> Repre
     if not all(jax.tree.leaves(same)):
         raise RepresentationError(f"{folder}: {PARAMETERS_FILE} holds arrays of other shapes; train it anew")
     return jax.tree.map(jax.numpy.asarray, loaded)
+
+
+def _contrast(env: Environment) -> list[float]:
+    return [env.state_spec.contrast, env.observation_spec.contrast]
 
 
 def _read_facts(folder: pathlib.Path) -> dict:

@@ -84,9 +84,9 @@ def _import(name: str, path: str) -> Callable[[], object]:
         sys.path.append(os.getcwd())  # console scripts, unlike `python -m`, do not look there
     try:
         module = importlib.import_module(module_name)
+        factory = getattr(module, attribute, None)  # some packages import only what is asked for
     except Exception as error:  # whatever a user's module raises while it is imported
         raise UnknownDomain(f"domain {name!r}: importing {module_name!r} failed: {_one_line(error)}") from error
-    factory = getattr(module, attribute, None)
     if not callable(factory):
         raise UnknownDomain(f"domain {name!r}: module {module_name!r} has no class {attribute!r}; "
                             f"accepted are {', '.join(names())}, or package.module:EnvClass")

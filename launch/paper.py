@@ -108,7 +108,7 @@ def check_same(run: RunFolder, options: train.TrainOptions) -> None:
     """Raise `RunError` if a run was made with other options than it would be now."""
     stored = {name: value for name, value in run.config().items() if name not in ("seed_list", "track")}
     there, wanted = (_flat(dataclasses.asdict(config)) for config in (config_from_dict(stored), options.config))
-    free = ("memory", "seeds.strategy")  # resolved from `auto` when stored; changes no numbers
+    free = ("memory", "seeds.strategy")  # resolved from `auto` when stored; not meant to change what is learnt
     other = [name for name, value in wanted.items() if there[name] != value and name not in free]
     if other:
         raise RunError(f"{run.path}: was made with --{other[0].replace('_', '-')} {there[other[0]]}, wanted "
@@ -299,8 +299,6 @@ def parse(arguments: Sequence[str]) -> tuple[str, Request]:
     reserved = [word for word in extra if word.split("=")[0] in ("--agent", "--memory", "--resume", "--representation")]
     require(not reserved, (reserved[0] if reserved else "").lstrip("-"), "a value",
             "nothing here, the experiment sets it")
-    if known.domain is not None:
-        registry.make(known.domain)
     seeds = parse_seeds(known.seeds)
     arms = None if known.arms is None else tuple(known.arms.split(","))
     if arms is not None:
@@ -314,11 +312,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         what, request = parse(sys.argv[1:] if arguments is None else arguments)
         runtime.prepare(host_devices=min(runtime.cores(), len(request.seeds)))
+        if request.domain is not None:
+            registry.make(request.domain)  # after `prepare`: a robot's physics starts JAX
         request.out.mkdir(parents=True, exist_ok=True)
         for name, domains in plan(what, request.domain):
             SAY(f"== {name}: {EXPERIMENTS[name].title}: {', '.join(domains)}")
             (run_intrinsic if name == "fig32" else run_curves)(name, request, domains)
-    except (*train.USER_ERRORS, OSError) as error:
+    except train.USER_ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except Stopped as stopped:

@@ -26,6 +26,7 @@ from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, req
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.metrics import RunError, RunFolder
 from mijax.representation.storage import RepresentationError, load_representation
+from mijax.rollout import Actor
 from mijax.seeds import evaluation_key, training_key
 
 USER_ERRORS = (ConfigError, RunError, RepresentationError, registry.UnknownDomain, registry.ContractError,
@@ -91,9 +92,10 @@ def load_learner_state(run: RunFolder, seed: int, learner: Learner) -> tuple[int
     return step, states[seed]
 
 
-def play(learner: Learner, state: LearnerState, key: jax.Array) -> list[EnvState]:
-    """The environment's states over one greedy episode, from the reset to the end, on the host."""
-    env, agent, params = learner.env, learner.agent, state.agent.target
+def play(learner: Learner, state: LearnerState, key: jax.Array, actor: Actor | None = None) -> list[EnvState]:
+    """The environment's states over one greedy episode, from the reset to the end, on the host; `actor`: played by
+    another than the agent."""
+    env, agent, params = learner.env, actor or learner.agent, state.agent.target
 
     @jax.jit
     def episode(params: Any, key: jax.Array) -> tuple[EnvState, EnvState, jax.Array]:
@@ -115,11 +117,10 @@ def play(learner: Learner, state: LearnerState, key: jax.Array) -> list[EnvState
 
 
 def evaluate_seed(
-    learner: Learner, state: LearnerState, key: jax.Array, episodes: int, remember: int = 0
+    learner: Learner, state: LearnerState, key: jax.Array, episodes: int, actor: Actor
 ) -> dict[str, float]:
     """Means over greedy episodes, the discounted return in fractions of the best possible where that is known, and of a
-    robot task the success by what was touched first; `remember`: see `EvaluateOptions`."""
-    actor = Forgetful(learner.agent, remember) if remember else learner.agent
+    robot task the success by what was touched first."""
     program = jax.jit(functools.partial(learner.evaluate, actor=actor), static_argnums=2)
     results = {name: float(np.mean(values)) for name, values in program(state, key, episodes).items()}
     if evaluate_robot.is_robot(learner.env):
@@ -167,8 +168,8 @@ def check(options: EvaluateOptions) -> None:
     policy = "planner" if options.planner else "random"
     require(options.run is None, policy, str(options.run), f"no run folder beside --{policy}")
     require(options.domain is not None, policy, True, f"with --domain, one of {evaluate_robot.DEMONSTRATED}")
-    require(options.seeds is None and not options.text, "seeds" if options.seeds else "text", options.seeds or True,
-            f"with a run only, not with --{policy}")
+    for name, given in (("seeds", options.seeds), ("text", options.text), ("remember", options.remember)):
+        require(not given, name, given, f"with a run only, not with --{policy}")
     require(options.planner or not (options.gif or options.html or options.out), "random", True,
             "without --gif, --html and --out: pictures are of --planner")
 
@@ -193,15 +194,15 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
         named = f"no seed {missing[0]}" if missing else "no seed"
         raise RunError(f"{run.path}: has {named} (it has {', '.join(map(str, present)) or 'none'})")
     learner = make_learner(registry.make(config.domain), config)
+    actor = Forgetful(learner.agent, options.remember) if options.remember else learner.agent
     rows, steps = {}, {}
     for seed in seeds:
         step, state = load_learner_state(run, seed, learner)
         key = evaluation_key(seed, step)
-        rows[str(seed)], steps[str(seed)] = evaluate_seed(
-            learner, state, key, options.episodes, options.remember), step
+        rows[str(seed)], steps[str(seed)] = evaluate_seed(learner, state, key, options.episodes, actor), step
         if options.gif or options.text:
             gif = run.seed_path(seed) / EPISODE_FILE if options.gif else None
-            show(learner.domain, play(learner, state, key), f"seed {seed}, step {step:,}", gif, options.text)
+            show(learner.domain, play(learner, state, key, actor), f"seed {seed}, step {step:,}", gif, options.text)
     print(f"{config.domain}, {config.agent}, {memory_of(config)}: {options.episodes} greedy episodes per seed")
     print(table(rows, steps))
     return rows

@@ -65,7 +65,8 @@ class Learner:
     pack: bool = True  # choose the number of packed rows at run time; a branch that `vmap` would turn into all of them
 
     def init(self, key: jax.Array, representation: Representation | None) -> LearnerState:
-        """Fresh networks and a replay warmed up by random episodes, after demonstrations where they are asked for."""
+        """Fresh networks, trained on the demonstrations where there are any, and a replay warmed up by random episodes.
+        """
         key_agent, key_start, key_warmup, key_run = jax.random.split(key, 4)
         num_envs = self.config.num_envs
         episodes = start_episodes(self.env, self.agent, num_envs, key_start)
@@ -73,7 +74,7 @@ class Learner:
         capacity = max(num_envs + self.demonstrations, self.agent.options.replay_steps // self.env.horizon)
         replay = init_replay(first, capacity, self.env.horizon, kept=self.demonstrations)
         if self.demonstrations:
-            replay = self._demonstrate(replay, representation, jax.random.fold_in(key_start, 1))
+            replay = self._demonstrate(replay, representation, jax.random.fold_in(key, 4))
         state = LearnerState(
             agent=self.agent.init(key_agent, representation),
             representation=representation,
@@ -82,12 +83,11 @@ class Learner:
             key=key_run,
             iteration=jnp.zeros((), jnp.int32),
         )
-        state, _ = self._collect(state, jnp.ones(()), self.warmup_steps // num_envs, key_warmup)
         if self.agent.declaration.believes:
-            state = dataclasses.replace(state, agent=self._believe(state, jax.random.fold_in(key_agent, 1)))
+            state = dataclasses.replace(state, agent=self._believe(state, jax.random.fold_in(key, 5)))
         if self.demonstrations and self.config.sac.pretrain_updates:
-            state, _ = self._learn(state, jax.random.fold_in(key_agent, 2), self.config.sac.pretrain_updates)
-        return state
+            state, _ = self._learn(state, jax.random.fold_in(key, 6), self.config.sac.pretrain_updates)
+        return self._collect(state, jnp.ones(()), self.warmup_steps // num_envs, key_warmup)[0]
 
     def _first(self, representation: Representation | None, episodes: Episodes) -> StepRecord:
         """What the replay stores of where episodes stand."""
@@ -95,11 +95,12 @@ class Learner:
             episodes.timestep, episodes.previous_action, episodes.env_state, episodes.symmetry)
 
     def _demonstrate(self, replay: Replay, representation: Representation | None, key: jax.Array) -> Replay:
-        """The replay with the successful episodes of an expert."""
-        shown = self.env.demonstrations(key, self.demonstrations)
+        """The replay with the successful episodes of an expert, some of them twice if it fails at times."""
+        key_episodes, key_symmetry = jax.random.split(key)
+        shown = self.env.demonstrations(key_episodes, self.demonstrations)
         assert shown is not None
         record, none = self.recorder(representation), self.agent.no_action(1)
-        symmetries = draw_symmetry(key, self.demonstrations)
+        symmetries = draw_symmetry(key_symmetry, self.demonstrations)
 
         def store(episode: tuple) -> StepRecord:
             env_state, action, symmetry = episode
@@ -109,8 +110,9 @@ class Learner:
 
         records = jax.lax.map(store, (shown.env_state, shown.action, symmetries))
         order = jnp.argsort(~shown.success, stable=True)
+        order = order[jnp.arange(self.demonstrations) % jnp.maximum(jnp.sum(shown.success), 1)]
         records, length = jax.tree.map(lambda x: x[order], (records, shown.length))
-        return fill(replay, records, length + 1, jnp.sum(shown.success, dtype=jnp.int32))
+        return fill(replay, records, length + 1)
 
     def _believe(self, state: LearnerState, key: jax.Array) -> AgentState:
         """Fit Believer's history VAE to as many random episodes as stage 1 has (paper Appendix A.5, Stage 2)."""
@@ -283,7 +285,7 @@ class Learner:
         if self.demonstrations and self.config.sac.imitation_weight > 0:
             expert = (slots >= self.config.num_envs) & (slots < self.config.num_envs + self.demonstrations)
             tokens = dataclasses.replace(tokens, demonstrated=expert[jnp.maximum(tokens.segment - 1, 0)])
-        copies, batch, key = self.agent.copies, slots.shape[0], jax.random.fold_in(key, 1)
+        copies, batch, key = self.agent.copies, slots.shape[0], jax.random.fold_in(key, 2)
         if self.moments:
             wants_state = self.agent.declaration.critic is not None
             return show_tokens(self.env, tokens, copies, batch, key, wants_state)

@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -55,17 +55,28 @@ class RunFolder:
     path: pathlib.Path
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], config: Mapping[str, Any]) -> "RunFolder":
-        """Start a new run in `path`, which must be empty or not exist. `config` holds the run's options by name."""
+    def create(
+        cls, path: str | os.PathLike[str], config: Mapping[str, Any], fill: Callable[["RunFolder"], None] | None = None
+    ) -> "RunFolder":
+        """Start a new run in `path`, which must be empty or not exist.
+
+        Args:
+            path: its folder.
+            config: the run's options by name.
+            fill: puts representations there, before the run counts as started.
+        """
         run = cls(pathlib.Path(path))
         if run._file("config.json").exists():
             raise RunError(f"{path}: already holds a run; continue it with --resume {path}, or choose another --out")
         with _named_errors(run.path):
             run.path.mkdir(parents=True, exist_ok=True)
             started = {"versions.json", "versions.json.tmp", "config.json.tmp"}  # a start that was killed leaves these
+            started |= {path.parent.name for path in run.path.glob("seed_*/representation")}
             foreign = sorted({entry.name for entry in run.path.iterdir()} - started)
         if foreign:
             raise RunError(f"{path}: not empty and not a run (it holds {foreign[0]}); choose another --out")
+        if fill is not None:
+            fill(run)
         _write_json(run._file("versions.json"), current_versions())
         _write_json(run._file("config.json"), config)
         return run
@@ -85,6 +96,11 @@ class RunFolder:
     def config(self) -> dict[str, Any]:
         """The run's options, as written by `create`."""
         return _read_json(self._file("config.json"))
+
+    def extend(self, steps: int) -> None:
+        """Give the run another budget of environment steps, so that it has not ended."""
+        self._file("summary.json").unlink(missing_ok=True)
+        _write_json(self._file("config.json"), self.config() | {"steps": steps})
 
     def versions(self) -> dict[str, Any]:
         """What the run was started with: python, packages, platform, commit."""

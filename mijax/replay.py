@@ -92,8 +92,8 @@ def finish(replay: Replay, done: jax.Array, length: jax.Array) -> Replay:
     )
 
 
-def fill(replay: Replay, records: StepRecord, length: jax.Array, number: jax.Array) -> Replay:
-    """Put the first () `number` of N whole episodes into a replay in which none has finished yet.
+def fill(replay: Replay, records: StepRecord, length: jax.Array) -> Replay:
+    """Put N whole episodes into a replay in which none has finished yet.
 
     Args:
         replay: of a capacity of at least N.
@@ -106,7 +106,7 @@ def fill(replay: Replay, records: StepRecord, length: jax.Array, number: jax.Arr
         data=jax.tree.map(lambda x, y: x.at[slots].set(y.astype(x.dtype)), replay.data, records),
         length=replay.length.at[slots].set(length),
         finished=replay.finished.at[: length.shape[0]].set(slots),
-        count=number.astype(jnp.int32),
+        count=jnp.int32(length.shape[0]),
     )
 
 
@@ -124,7 +124,7 @@ def sample_episodes(replay: Replay, key: jax.Array, batch: int, share: float = 0
         return 2 * jax.random.randint(key, (batch,), 0, jnp.maximum((number + 1 - fold) // 2, 1)) + fold
 
     place = uniform(key, number)
-    if share > 0:
+    if share > 0 and replay.kept:
         key_which, key_kept = jax.random.split(jax.random.fold_in(key, 1))
         place = jnp.where(jax.random.bernoulli(key_which, share, (batch,)), uniform(key_kept, replay.kept), place)
     return replay.finished[jnp.minimum(place, number - 1)]

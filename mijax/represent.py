@@ -50,27 +50,36 @@ def parse(arguments: Sequence[str]) -> RepresentOptions:
     return tyro.cli(RepresentOptions, default=default, args=list(arguments), prog="python -m mijax.represent")
 
 
+def open_run(options: RepresentOptions, seeds: Sequence[int]) -> RunFolder:
+    """A new run folder, or the one that the same command made before it was stopped."""
+    path = options.out or pathlib.Path("runs") / f"{options.domain.replace(':', '.')}-representation"
+    stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
+    if (path / "config.json").exists() and not options.search:
+        run = RunFolder.open(path)
+        if run.config() == stored:
+            return run
+        raise RunError(f"{path}: was made with other options; choose another --out")
+    return RunFolder.create(path, stored)
+
+
+def represent(options: RepresentOptions) -> None:
+    """Train, probe and keep the representation of every seed that has none yet; fine if one fails its probe."""
+    require(options.search >= 0, "search", options.search, "a number >= 1, or 0 for none")
+    seeds, env = parse_seeds(options.seeds), registry.make(options.domain)
+    run = open_run(options, seeds)
+    if options.search:
+        passed = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print).best.passed
+    else:
+        stage1.representations(run, env, options.stage1, seeds, print)
+        passed = sum(stage1.passed(run, seed) for seed in seeds)
+    print(f"{passed} of {len(seeds)} representations pass P1 and P2")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; 0 when all went well, also if a representation fails its probe."""
+    """Run the command."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
     runtime.prepare(host_devices=runtime.cores() if options.search else 1)
-    try:
-        require(options.search >= 0, "search", options.search, "a number >= 1, or 0 for none")
-        seeds, env = parse_seeds(options.seeds), registry.make(options.domain)
-        name = f"{options.domain.replace(':', '.')}-representation"
-        stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
-        run = RunFolder.create(options.out or pathlib.Path("runs") / name, stored)
-        if options.search:
-            found = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print)
-            passed = found.best.passed
-        else:
-            reports = [stage1.learn(run, env, options.stage1, seed, print) for seed in seeds]
-            passed = sum(report.p1 and report.p2 for report in reports)
-    except USER_ERRORS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print(f"{passed} of {len(seeds)} representations pass P1 and P2")
-    return 0
+    return runtime.exit_code(lambda: represent(options), USER_ERRORS)
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ def start_episodes(env: Environment, agent: Actor, num_envs: int, key: jax.Array
 
 
 def draw_symmetry(key: jax.Array, num: int) -> jax.Array:
-    """(num, 2) uint32, one for each episode; besides it, `key` may draw whatever else it draws."""
+    """(num, 2) uint32, one for each episode; besides it, `key` may be split up to `num` ways."""
     return jax.random.bits(jax.random.fold_in(key, num), (num, 2), jnp.uint32)
 
 

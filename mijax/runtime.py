@@ -44,9 +44,12 @@ def release_memory() -> None:
 
 
 def exit_code(work: Callable[[], object], user_errors: tuple[type[BaseException], ...]) -> int:
-    """0 once a command's work is done; 1 after one line on what the user can mend."""
+    """0 once a command's work is done; 1 after one line on what the user can mend; 130 after Ctrl-C."""
     try:
         work()
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
     except user_errors as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

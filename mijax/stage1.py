@@ -33,18 +33,35 @@ def folder_of(run: RunFolder, seed: int) -> pathlib.Path:
     return run.seed_path(seed) / FOLDER
 
 
-def reuse(source: RunFolder, run: RunFolder, env: Environment, seeds: tuple[int, ...]) -> None:
-    """Copy representations from another run: the same seed's where it has one, else its first.
+def reuse(
+    source: RunFolder, env: Environment, features: int, seeds: tuple[int, ...]
+) -> Callable[[RunFolder], None]:
+    """Read representations of another run, the same seed's where it has one, else its first; the result puts them, and
+    what their probes found, into a run.
 
     Raises:
-        RunError: the other run is of another domain or has no representation.
+        RunError: the other run is of another domain, or has no representation of so many features.
+        RepresentationError: one of them is damaged.
     """
-    found = [seed for seed in source.seeds() if folder_of(source, seed).is_dir()]
+    source.require(domain=env.name)
+    found = [seed for seed in source.seeds() if (folder_of(source, seed) / FACTS_FILE).exists()]
     if not found:
         raise RunError(f"{source.path}: holds no representation (no seed_K/{FOLDER})")
-    for seed in seeds:
-        origin = folder_of(source, seed if seed in found else found[0])
-        save_representation(load_representation(origin, env), env, folder_of(run, seed))
+    origins = {seed: folder_of(source, seed if seed in found else found[0]) for seed in seeds}
+    read = {seed: load_representation(origin, env) for seed, origin in origins.items()}
+    widths = {representation.z_s_mean.shape[0] for representation in read.values()} - {features}
+    if widths:
+        raise RunError(f"{source.path}: holds features {widths.pop()} wide, wanted --stage1.features {features}")
+
+    def put(run: RunFolder) -> None:
+        for seed, origin in origins.items():
+            folder, probed = folder_of(run, seed), origin / PROBE_FILE
+            folder.mkdir(parents=True, exist_ok=True)
+            if probed.exists():
+                write_atomically(folder / PROBE_FILE, probed.read_bytes())
+            save_representation(read[seed], env, folder)
+
+    return put
 
 
 def representations(
@@ -66,7 +83,7 @@ def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say
     key, folder = representation_key(seed), folder_of(run, seed)
     with ProgressDisplay(f"stage 1, seed {seed}", config.epochs, unit="epochs") as progress:
         representation, history = learn_representation(env, config, key, on_progress=progress.update)
-    report = probe(representation, env, config, jax.random.fold_in(key, 1), history)
+    report = probe(representation, env, config, jax.random.fold_in(key, 3), history)
     timing = {"updates": history.updates, "updates_per_second": history.updates_per_second,
               "compile_seconds": history.compile_seconds, "seconds": history.seconds}
     _keep(folder, env, representation, report, timing)
@@ -74,6 +91,12 @@ def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say
     say(f"stage 1, seed {seed}: {history.updates} updates in {history.compile_seconds + history.seconds:.0f} s "
         f"({history.updates_per_second:.0f}/s), kept in {folder}\n{format_report(report)}")
     return report
+
+
+def passed(run: RunFolder, seed: int) -> bool:
+    """Whether a seed's representation passed P1 and P2 when it was made."""
+    report = json.loads((folder_of(run, seed) / PROBE_FILE).read_text())
+    return report["p1"] and report["p2"]
 
 
 def choose_weights(
@@ -103,5 +126,6 @@ def choose_weights(
 def _keep(
     folder: pathlib.Path, env: Environment, representation: Representation, report: ProbeReport, facts: dict[str, Any]
 ) -> None:
-    save_representation(representation, env, folder)
+    folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / PROBE_FILE, json.dumps(report.as_dict() | facts, indent=2).encode())
+    save_representation(representation, env, folder)  # last: where it is, the probe's result is

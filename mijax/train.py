@@ -32,7 +32,7 @@ from mijax.seeds import SeedRunner, training_key
 FINAL_EPISODES = 500
 """Greedy episodes of each seed behind the numbers of summary.json."""
 USER_ERRORS = (ConfigError, RunError, RepresentationError, DivergenceError, registry.UnknownDomain,
-               registry.ContractError)
+               registry.ContractError, OSError)
 """What a user can mend: shown as one line."""
 
 
@@ -52,7 +52,8 @@ class TrainOptions:
     out: pathlib.Path | None = None
     """Run folder to make; default runs/DOMAIN-AGENT-MEMORY."""
     resume: pathlib.Path | None = None
-    """Run folder to go on with, under its own options; only --steps may be given with it."""
+    """Run folder to go on with, under its own options; only --steps may be given with it, and stretches the schedules
+    of step size and imitation."""
     representation: pathlib.Path | None = None
     """Run whose stage 1 is taken over instead of training one."""
     track: TrackerName = "none"
@@ -71,16 +72,19 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
         return _resumed(known, others, arguments)
     config = configs.preset(known.domain)
     if known.preset == "paper":
-        config = paper(config, vector_observation=not registry.make(known.domain).observation_spec.is_image)
+        robot = known.domain in configs.ROBOTS  # not made here: their physics starts JAX, before its devices are set
+        config = paper(config, not robot and not registry.make(known.domain).observation_spec.is_image)
     default = TrainOptions(config=config)
     return tyro.cli(TrainOptions, default=default, args=list(arguments), prog="python -m mijax.train")
 
 
 def _resumed(known: argparse.Namespace, others: Sequence[str], arguments: Sequence[str]) -> TrainOptions:
-    stray = [word for word in others if word.startswith("--")]
-    stray += ["--domain"] if any(word.split("=")[0] == "--domain" for word in arguments) else []
+    stray = [*others, *(word for word in arguments if word.split("=")[0] in ("--domain", "--preset"))]
     require(not stray, "resume", " ".join(stray), "no other option than --steps: a run goes on under its own")
-    stored = RunFolder.open(known.resume).config()
+    run = RunFolder.open(known.resume)
+    stored = run.config()
+    if "agent" not in stored:
+        raise RunError(f"{run.path}: holds representations but no agent to go on with")
     seeds, track = stored.pop("seed_list"), stored.pop("track")
     config = config_from_dict(stored)
     if known.steps is not None:
@@ -89,16 +93,19 @@ def _resumed(known: argparse.Namespace, others: Sequence[str], arguments: Sequen
     return TrainOptions(config, seeds=",".join(map(str, seeds)) + ",", resume=known.resume, track=track)
 
 
-def open_run(options: TrainOptions) -> RunFolder:
-    """The run folder to work in: a new one, or the one to go on with."""
-    if options.resume is not None:
-        return RunFolder.open(options.resume)
+def open_run(options: TrainOptions, fill: Callable[[RunFolder], None] | None = None) -> RunFolder:
+    """The run folder to work in: a new one, which `fill` puts representations into, or the one to go on with."""
     config = options.config
+    if options.resume is not None:
+        run = RunFolder.open(options.resume)
+        if run.config()["steps"] != config.steps:
+            run.extend(config.steps)
+        return run
     memory = memory_of(config)
     name = f"{config.domain.replace(':', '.')}-{config.agent}-{memory}"
     stored = dataclasses.asdict(config) | {
         "memory": memory, "seed_list": list(parse_seeds(options.seeds)), "track": options.track}
-    return RunFolder.create(options.out or pathlib.Path("runs") / name, stored)
+    return RunFolder.create(options.out or pathlib.Path("runs") / name, stored, fill)
 
 
 class CompileClock:
@@ -146,13 +153,14 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     config, seeds = options.config, parse_seeds(options.seeds)
     env = registry.make(config.domain)
     registry.check_contract(env)
-    make_learner(env, config)  # refuses what cannot be trained before anything is written
-    source = None if options.representation is None else RunFolder.open(options.representation)
-    if source is not None:
-        source.require(domain=config.domain)
-    run = open_run(options)
-    if source is not None and needs_representation(config):
-        stage1.reuse(source, run, env, seeds)
+    fill = None  # what cannot be trained is refused before anything is written
+    warmup = make_learner(env, config).warmup_steps
+    require(config.steps > warmup, "steps", config.steps, f"more than the {warmup} of the warm-up")
+    if options.representation is not None:
+        require(needs_representation(config), "representation", options.representation,
+                f"none: --agent {config.agent} looks through no features here")
+        fill = stage1.reuse(RunFolder.open(options.representation), env, config.stage1.features, seeds)
+    run = open_run(options, fill)
     title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))
     say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
 
@@ -176,7 +184,7 @@ def _start(
     say: Callable[[str], None],
 ) -> None:
     """From the newest checkpoint, or from scratch; metrics after it are dropped and will be written again."""
-    if any(each.steps() for each in checkpoints.values()):
+    if all(each.steps() for each in checkpoints.values()):
         representation = None if learnt is None else learnt[runner.seeds[0]]
         template = jax.eval_shape(runner.learner.init, training_key(0), representation)
         step, states = checkpoint.load_latest(checkpoints, template, say)
@@ -286,17 +294,14 @@ def _conclude(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    try:
-        options = parse(arguments)
-        seeds = parse_seeds(options.seeds)
-        shard = options.config.seeds.strategy == "shard" or (options.config.seeds.strategy == "auto" and len(seeds) > 1)
+    def work() -> None:
+        options = parse(sys.argv[1:] if arguments is None else arguments)
+        seeds, strategy = parse_seeds(options.seeds), options.config.seeds.strategy
+        shard = strategy == "shard" or (strategy == "auto" and len(seeds) > 1)
         runtime.prepare(host_devices=min(runtime.cores(), len(seeds)) if shard else 1)
         train(options)
-    except USER_ERRORS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+
+    return runtime.exit_code(work, USER_ERRORS)
 
 
 if __name__ == "__main__":

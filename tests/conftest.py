@@ -21,6 +21,14 @@ for flag, value in (("--xla_force_host_platform_device_count", 2), ("--xla_backe
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+LONG = ("test_train.py", "test_bench.py", "test_learner.py", "test_variants.py", "test_sac.py", "test_export.py",
+        "test_representation.py", "test_dqn.py", "test_paper.py", "test_robot_tasks.py", "test_page.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first: workers take whole files, and none is to end with a long one alone."""
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
 
 @pytest.fixture(autouse=True)
 def loud_shapes_and_types(request: pytest.FixtureRequest) -> Iterator[None]:

@@ -168,6 +168,9 @@ def test_environment_of_the_current_directory(tmp_path, monkeypatch: pytest.Monk
     env = registry.make("my_worlds:Mine")
     registry.check_contract(env)
     assert env.name == "mine"
+    (tmp_path / "lazy_worlds.py").write_text("def __getattr__(name):\n    raise ImportError('no physics here')\n")
+    with pytest.raises(registry.UnknownDomain, match="importing 'lazy_worlds' failed: ImportError: no physics here"):
+        registry.make("lazy_worlds:Mine")
 
 
 def test_register(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,6 +71,27 @@ def test_a_killed_start_can_be_started_again(tmp_path):
     assert RunFolder.create(tmp_path, CONFIG).versions()["python"]
 
 
+def test_a_run_starts_with_its_representations_or_not_at_all(tmp_path):
+    def killed(run: RunFolder) -> None:
+        (run.seed_path(0) / "representation").mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        RunFolder.create(tmp_path, CONFIG, killed)
+    with pytest.raises(RunError, match=r"no config\.json"):
+        RunFolder.open(tmp_path)
+    filled = []
+    assert RunFolder.create(tmp_path, CONFIG, filled.append).config()
+    assert filled == [RunFolder(tmp_path)]
+
+
+def test_another_budget_makes_a_run_go_on(run):
+    run.write_summary({})
+    run.extend(9000)
+    assert run.summary() is None
+    assert run.config() == {**RunFolder.open(run.path).config(), "steps": 9000}
+
+
 def test_unusable_folders_are_named(tmp_path, run):
     with pytest.raises(RunError, match="already holds a run; continue it with --resume") as error:
         RunFolder.create(run.path, CONFIG)

@@ -134,6 +134,9 @@ def test_kept_episodes_stay_and_have_their_share():
     drawn = np.asarray(jax.jit(sample_episodes, static_argnums=(2, 3))(replay, jax.random.key(0), 4000, 0.5))
     expected = 0.5 + 0.5 * kept / len(ring)
     np.testing.assert_allclose(np.isin(drawn, ring[:kept]).mean(), expected, atol=0.04)
+    unkept = dataclasses.replace(replay, kept=0)  # such as Believer's before it learns: no share of nothing
+    drawn = np.asarray(jax.jit(sample_episodes, static_argnums=(2, 3))(unkept, jax.random.key(0), 4000, 0.5))
+    np.testing.assert_allclose(np.isin(drawn, ring[:kept]).mean(), kept / len(ring), atol=0.04)
     with pytest.raises(ValueError, match="beside 9 that are kept"):
         init_replay(jax.tree.map(lambda x: x[:, 0], replay.data), 9, HORIZON, 9)
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,6 +142,11 @@ def test_a_stored_configuration_comes_back() -> None:
     (["--agent", "best"], "--agent"),
     (["--dqn.batch-episodes", "7"], "--dqn.batch-episodes"),
     (["--steps", "-5"], "--steps"),
+    (["--steps", "2000"], "more than the 2000 of the warm-up"),
+    (["--stage1.heldout-episodes", "1"], "--stage1.heldout-episodes"),
+    (["--stage1.data", "demonstrations"], "--stage1.data"),
+    (["--sac.trunk", "psi"], "--sac.trunk"),
+    (["--network.dropout", "0.99"], "--network.dropout"),
     (["--evaluation.every", "33"], "--evaluation.every"),
     (["--resume", "/nonexistent"], "/nonexistent"),
     (["--domain", "json:dumps"], "json"),
@@ -162,6 +168,46 @@ def test_a_representation_of_another_domain_is_refused(whole_run: pathlib.Path, 
     assert train.main(arguments) == 1
     assert "heaven_hell" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("arguments", "named"), [
+    (["--resume", "RUN", "--preset", "paper"], "--resume: got '--preset'"),
+    (["--resume", "RUN", "other"], "--resume: got 'other'"),
+    (["--agent", "base", "--representation", "RUN"], "--agent base looks through no features here"),
+    (["--stage1.features", "16", "--representation", "RUN"], "holds features 32 wide, wanted --stage1.features 16"),
+])
+def test_what_does_not_go_with_a_run_is_refused(
+    whole_run: pathlib.Path, arguments: list[str], named: str, tmp_path: pathlib.Path,
+    capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")}
+    words = [str(whole_run) if word == "RUN" else word for word in arguments]
+    assert train.main(words if "--resume" in words else [*words, "--out", str(tmp_path / "run")]) == 1
+    assert named in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    assert {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")} == before
+
+
+def test_a_kill_between_the_first_checkpoints_of_two_seeds_starts_over(whole_run: pathlib.Path) -> None:
+    class Stub:
+        """A checkpoint folder, a run and a runner that note what is asked of them."""
+
+        def __init__(self, *steps: int) -> None:
+            self.asked, self._steps = [], steps
+
+        def steps(self) -> tuple[int, ...]:
+            return self._steps
+
+        def init(self, learnt: object) -> None:
+            self.asked.append(learnt)
+
+        def truncate_after(self, step: int) -> None:
+            self.asked.append(step)
+
+    runner, run = Stub(), Stub()
+    there: Any = {0: Stub(400), 3: Stub()}
+    train._start(runner, run, there, None, print)  # pyright: ignore[reportArgumentType]
+    assert (run.asked, runner.asked) == ([-1], [None])
 
 
 def test_divergence_is_named() -> None:

@@ -164,8 +164,10 @@ def test_belief_loss_by_hand():
     rep = agent.representation
     assert rep is not None
     z = (np.asarray(agent.tokens.z_s) - np.arange(FEATURES)) / np.sqrt(2)
-    decoded, mean, log_variance, log_scale = (
-        np.asarray(x, float) for x in agent.outputs(dataclasses.replace(agent.tokens, z_s=jnp.asarray(z))).belief)
+    outputs: Any = agent.dqn.network.apply(  # a gradient pass: its latents are drawn, dropout or not
+        {"params": agent.state.params["agent"]}, dataclasses.replace(agent.tokens, z_s=jnp.asarray(z)), False,
+        rngs={"dropout": jax.random.split(jax.random.key(0))[0]})
+    decoded, mean, log_variance, log_scale = (np.asarray(x, float) for x in outputs.belief)
     terms = []
     for row, first, end in SPANS:
         for t in range(first, end):

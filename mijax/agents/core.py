@@ -11,7 +11,7 @@ import optax
 from flax import struct
 
 from envs_mjx.base import ContinuousActions, Environment
-from mijax.agents.variants import Variant
+from mijax.agents.variants import Variant, memory_of
 from mijax.config import Config, DQNConfig, SACConfig
 from mijax.losses import information as info
 from mijax.losses.belief import negative_elbo
@@ -206,8 +206,10 @@ class Agent(abc.ABC):
 
     @property
     def _exact(self) -> bool:
-        """Whether gradient passes are free of dropout, so that their outputs serve targets and bonus too."""
-        return self.config.network.dropout == 0
+        """Whether gradient passes draw nothing, neither dropout nor Believer's latents, so that their outputs serve
+        targets and bonus too."""
+        drops = self.config.network.dropout > 0 and memory_of(self.config) == "gpt"
+        return not drops and not self.declaration.believes
 
     def _apply(self, module: Any, params: Params, tokens: Tokens, key: jax.Array) -> Any:
         return module.apply({"params": params}, tokens, self._exact, rngs={"dropout": key})
@@ -232,9 +234,12 @@ class Agent(abc.ABC):
         f = representation.destandardise(jnp.concatenate([
             self._apply(self.information_model, *arguments) for arguments in zip(params, folds, keys, strict=True)]))
         loss_f, parts_f = info.prediction_mse(f, z_s, real, variance)
-        f_t = jnp.concatenate([
-            self._clean(self.information_model, *arguments) for arguments in zip(params[::-1], folds, strict=True)])
-        f_t = jax.lax.stop_gradient(representation.destandardise(f_t))
+        if self._exact and len(params) == 1:
+            f_t = jax.lax.stop_gradient(f)
+        else:
+            f_t = jnp.concatenate([
+                self._clean(self.information_model, *arguments) for arguments in zip(params[::-1], folds, strict=True)])
+            f_t = jax.lax.stop_gradient(representation.destandardise(f_t))
         _, parts_t = info.prediction_mse(f_t, z_s, real, variance)
         f_tm1 = jnp.roll(f_t, 1, axis=1)
         if options.intrinsic_form == "cosine":

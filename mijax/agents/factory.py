@@ -6,7 +6,7 @@ from envs_mjx.base import DiscreteActions, Environment
 from mijax.agents.core import Agent
 from mijax.agents.dqn import make_dqn
 from mijax.agents.sac import make_sac
-from mijax.agents.variants import memory_of
+from mijax.agents.variants import memory_of, needs_representation
 from mijax.augmentation import shows_again
 from mijax.config import Config, require
 
@@ -24,6 +24,11 @@ def make_agent(env: Environment, config: Config) -> Agent:
     demonstrations = 0 if isinstance(env.action_spec, DiscreteActions) else config.sac.demonstrations
     require(demonstrations == 0 or has_expert(env), "sac.demonstrations", demonstrations,
             f"0, as {env.name} has no expert")
+    if isinstance(env.action_spec, DiscreteActions):
+        require(config.sac.trunk != "psi", "sac.trunk", config.sac.trunk, f"own or shared: {env.name} is not for SAC")
+    if needs_representation(config):
+        require(config.stage1.data == "random" or has_expert(env), "stage1.data", config.stage1.data,
+                f"random, as {env.name} has no expert")
     return agent
 
 

@@ -60,11 +60,11 @@ class Forgetful:
         window = Window(shift(memory.observation, observation), shift(memory.previous_action, previous_action),
                         memory.count + 1)
         first, fresh = self.steps - jnp.minimum(window.count, self.steps), self.agent.initial_memory(len(observation))
-        action, state = previous_action, fresh
+        action, state, none = previous_action, fresh, self.agent.no_action(len(observation))
         for step in range(self.steps):
             state = jax.tree.map(lambda new, old, step=step: jnp.where(step <= first, new, old), fresh, state)
-            state, action = self.agent.act(
-                params, state, window.observation[:, step], window.previous_action[:, step])
+            previous = jnp.where(step <= first, none, window.previous_action[:, step])
+            state, action = self.agent.act(params, state, window.observation[:, step], previous)
         return window, action
 
     def value(

@@ -92,7 +92,7 @@ class Problem:
             copy = jnp.pad(chosen >= self.data.size, (0, rows.size - chosen.size), constant_values=True)
             rows, shown = self._augment(rows, copy, jax.random.fold_in(key, 2))
         if self.config.lambda_kl > 0:
-            noise = jax.random.normal(jax.random.fold_in(key, 1), (rows.size, self.config.features))
+            noise = jax.random.normal(jax.random.fold_in(key, 3), (rows.size, self.config.features))
         return Batch(rows, weight, reward_weight, shown, noise)
 
     def _augment(self, rows: TransitionTable, copy: jax.Array, key: jax.Array) -> tuple[TransitionTable, Shown]:

@@ -11,6 +11,7 @@ import pytest
 
 from envs_mjx import registry
 from envs_mjx.base import ContinuousActions, DiscreteActions, Variable
+from mijax import evaluate
 from mijax.metrics import RunError, RunFolder
 from mijax.results import load, summarise
 
@@ -225,8 +226,12 @@ def test_ppo_with_a_privileged_critic_writes_a_run_like_ours(tmp_path: pathlib.P
     assert summarise(run)["domain"] == "heaven_hell"
     assert load([run.path])[0].curves("evaluation/return")
     assert (run.path / "curve.png").exists()
+    with pytest.raises(RunError, match="its agent 'ppo' is another program's"):
+        evaluate.config_of(run)
     with pytest.raises(RunError, match="already holds a run"):
         brax_ppo.train(options)
     assert brax_ppo.main(["--out", str(run.path)]) == 1
     assert brax_ppo.main(["--num-envs", "3"]) == 1
-    assert RunFolder.open(run.path).config()["critic"] == "history_state"
+    config = RunFolder.open(run.path).config()
+    assert config["critic"] == "history_state"
+    assert not {"out", "seeds"} & set(config)

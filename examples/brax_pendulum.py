@@ -2,6 +2,9 @@
 
     pip install 'mijax[robot]'
     python -m mijax.train --domain examples.brax_pendulum:Pendulum --agent base --memory gru --steps 10000
+
+With `--sac.updates-per-step 0.25` that takes five minutes on a busy core, and the pole then stands for 80 of 100 steps,
+from 12 at the first evaluation and still rising (one seed).
 """
 
 import jax

@@ -297,7 +297,10 @@ class FromGymnasium(Environment):
                     break
             return seen
 
-        first, _, again, anew = play(env, 1), play(env, 2), play(env, 1), play(self._make(), 1)
+        fresh = self._make()
+        first, _, again, anew = play(env, 1), play(env, 2), play(env, 1), play(fresh, 1)
+        env.close()
+        fresh.close()
         for other in (again, anew):
             if len(first) != len(other) or not all(map(np.array_equal, first, other)):
                 raise ValueError(f"{self.name}: two episodes with the same seed and actions differ, accepted: a "

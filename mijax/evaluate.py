@@ -21,7 +21,7 @@ from envs_mjx.grid import draw
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, evaluate_robot, runtime, stage1
 from mijax.agents.forgetful import Forgetful
-from mijax.agents.variants import memory_of, needs_representation
+from mijax.agents.variants import VARIANTS, memory_of, needs_representation
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.metrics import RunError, RunFolder
@@ -75,6 +75,8 @@ def config_of(run: RunFolder) -> Config:
     stored = run.config()
     if "agent" not in stored:
         raise RunError(f"{run.path}: holds representations but no agent to evaluate")
+    if stored["agent"] not in VARIANTS:
+        raise RunError(f"{run.path}: its agent {stored['agent']!r} is another program's, accepted: mijax.train's runs")
     return config_from_dict({name: value for name, value in stored.items() if name not in ("seed_list", "track")})
 
 

@@ -1,20 +1,28 @@
 """Other libraries' environments as ours, and ours as theirs."""
 
+import functools
+import pathlib
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from envs_mjx import registry
-from envs_mjx.base import ContinuousActions
+from envs_mjx.base import ContinuousActions, Variable
+from mijax import train
+from mijax.metrics import RunFolder
 
 gymnasium = pytest.importorskip("gymnasium")
 gymnax = pytest.importorskip("gymnax")
 
+from gymnasium import spaces  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from envs_mjx.adapters.gymnasium import AsGymnasium  # noqa: E402
+from envs_mjx.adapters.gymnasium import AsGymnasium, FromGymnasium  # noqa: E402
 from envs_mjx.adapters.gymnax import FromGymnax  # noqa: E402
+from examples.gymnasium_memory import LENGTH, Maze, TMaze  # noqa: E402
 
 ROBOTS = {"block_pulling", "block_pushing", "drawer_opening"}
 
@@ -86,3 +94,122 @@ def test_gymnax_bounds_and_time_limits():
 def test_what_does_not_fit_is_named():
     with pytest.raises(ValueError, match="no field 'contex', accepted: time, context"):
         FromGymnax(*gymnax.make("MemoryChain-bsuite"), hidden=("contex",))
+
+
+def play(env: FromGymnasium, keys: jax.Array, actions: jax.Array) -> tuple:
+    """Compiled: (T, E, ...) time steps of E episodes under (T, E, ...) actions, and the last moment."""
+
+    @jax.jit
+    def run(keys: jax.Array, actions: jax.Array) -> tuple:
+        def step(moment: Any, action: jax.Array) -> tuple:
+            return jax.vmap(env.step)(keys, moment, action)
+
+        return jax.lax.scan(step, jax.vmap(env.reset)(keys)[0], actions)
+
+    return run(keys, actions)
+
+
+def test_a_gymnasium_environment_keeps_our_contract():
+    check_env(TMaze(), skip_render_check=True)
+    env = registry.make("examples.gymnasium_memory:Maze")
+    registry.check_contract(env)
+    actions = jnp.array([[0] * 8] * LENGTH + [[1] * 8] + [[0] * 8] * 2, jnp.int32)  # left, then two steps too many
+    moment, steps = play(Maze(), jax.random.split(jax.random.key(0), 8), actions)
+    side = np.asarray(moment.state[:, 1])
+    assert set(side) == {-1.0, 1.0}
+    np.testing.assert_array_equal(steps.state[:, :, 1], np.tile(side, (LENGTH + 3, 1)))
+    np.testing.assert_array_equal(steps.observation[:, :, 1], np.zeros((LENGTH + 3, 8)))
+    np.testing.assert_array_equal(steps.reward[LENGTH], -side)
+    np.testing.assert_array_equal(steps.terminated[:LENGTH + 1].any(axis=1), [False] * LENGTH + [True])
+    np.testing.assert_array_equal(steps.reward[LENGTH + 1 :], np.zeros((2, 8)))
+    np.testing.assert_array_equal(moment.time, [LENGTH + 1] * 8)
+    np.testing.assert_array_equal(jax.vmap(env.ground_truth)(moment), moment.state)
+    waits = play(Maze(), jax.random.split(jax.random.key(0), 8), jnp.ones((20, 8), jnp.int32))[1]
+    np.testing.assert_array_equal(waits.truncated[:, 0], [False] * 19 + [True])
+    assert not waits.terminated.any()
+
+
+def test_moments_of_the_host_may_be_stepped_in_any_order():
+    """What a simulator no longer holds is played again: a moment twice, in another process, with little room."""
+    env, small = Maze(), Maze()
+    small._room = 1
+    small._make_room = lambda batch: None
+    keys = jax.random.split(jax.random.key(1), 5)
+    actions = jax.random.randint(jax.random.key(2), (12, 5), 0, 3, jnp.int32)
+    last, steps = play(env, keys, actions)
+    other, again = play(small, keys, actions)
+    jax.tree.map(np.testing.assert_array_equal, (last, steps), (other, again))
+    assert len(small._live) == 1
+    step = jax.jit(jax.vmap(env.step))
+    first, second = step(keys, last, actions[0]), step(keys, last, actions[0])
+    elsewhere = jax.jit(jax.vmap(Maze().step))(keys, last, actions[0])
+    for other in (second, elsewhere):
+        jax.tree.map(np.testing.assert_array_equal, first, other)
+    nested = jax.vmap(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), (2, 3)))[1]
+    alone = env.reset(jax.random.split(jax.random.key(0), (2, 3))[1, 2])[1]
+    np.testing.assert_array_equal(nested.state[1, 2], alone.state)
+
+
+def test_gymnasium_bounds_and_time_limits():
+    env = FromGymnasium(functools.partial(gymnasium.make, "Pendulum-v1"), horizon=3)
+    assert isinstance(env.action_spec, ContinuousActions)
+    assert (env.name, env.observation_spec.shape) == ("Pendulum-v1", (3,))
+    registry.check_contract(env)
+    moment, steps = play(env, jax.random.split(jax.random.key(0), 1), jnp.ones((3, 1, 1)))
+    theirs = gymnasium.make("Pendulum-v1")
+    theirs.reset(seed=int(moment.seed[0]))
+    for time in range(3):
+        seen, reward, *_ = theirs.step(np.array([2.0], np.float32))
+        np.testing.assert_allclose(steps.observation[time, 0], seen, rtol=1e-6)
+        np.testing.assert_allclose(steps.reward[time, 0], reward, rtol=1e-6)
+    np.testing.assert_array_equal(steps.truncated[:, 0], [False, False, True])
+
+
+class Forgetting(TMaze):
+    """Draws from outside of its own generator."""
+
+    draw = np.random.default_rng(0)
+
+    def reset(self, **kwargs: Any) -> tuple:
+        super().reset(**kwargs)
+        self._side = int(self.draw.integers(1_000_000))
+        return self._show()
+
+
+class Talking(TMaze):
+    """Observes text."""
+
+    observation_space = spaces.Text(3)  # pyright: ignore[reportAssignmentType]
+
+
+def test_what_does_not_fit_of_gymnasium_is_named():
+    with pytest.raises(ValueError, match="horizon: TMaze has no time limit"):
+        FromGymnasium(TMaze)
+    with pytest.raises(ValueError, match="has no 'truth', accepted: state"):
+        FromGymnasium(TMaze, horizon=9, state="truth")
+    with pytest.raises(ValueError, match="its observations are Text"):
+        FromGymnasium(Talking, horizon=9)
+    with pytest.raises(ValueError, match="with the same seed and actions differ"):
+        FromGymnasium(Forgetting, horizon=9, state="state")
+    with pytest.raises(ValueError, match="one for each of the state's 2 numbers"):
+        FromGymnasium(TMaze, horizon=9, variables=(Variable("place", hidden=False),))
+
+
+@pytest.mark.slow
+@pytest.mark.lenient
+def test_training_on_the_host_resumes_bit_for_bit(tmp_path: pathlib.Path):
+    arguments = [
+        "--domain", "examples.gymnasium_memory:Maze", "--agent", "base", "--memory", "gru", "--seeds.strategy", "map",
+        "--network.critic-hidden", "8", "--dqn.batch-episodes", "4", "--dqn.replay-steps", "2000",
+        "--dqn.warmup-episodes", "4", "--dqn.final-learning-rate", "1", "--evaluation.every", "100",
+        "--evaluation.episodes", "4", "--checkpoint.every", "1"]
+
+    def rows(name: str) -> list[dict]:
+        found = RunFolder.open(tmp_path / name).metrics(0)
+        return [{key: value for key, value in row.items() if not key.startswith("wall/")} for row in found]
+
+    assert train.main([*arguments, "--steps", "480", "--out", str(tmp_path / "whole")]) == 0
+    assert train.main([*arguments, "--steps", "280", "--out", str(tmp_path / "parts")]) == 0
+    assert train.main(["--resume", str(tmp_path / "parts"), "--steps", "480"]) == 0
+    assert len(rows("whole")) == 4
+    assert rows("whole") == rows("parts")

@@ -62,7 +62,9 @@ PARSERS: dict[str, Callable[[list[str]], object]] = {
     "mijax.transfer": functools.partial(options_of, transfer.TransferOptions),
     "launch.fusion": functools.partial(options_of, fusion.FusionOptions),
     "envs_mjx.robot.camera_files": camera_files.parse,
-    "launch.paper": experiments.parse, "launch.bench": bench.parse}
+    "launch.paper": experiments.parse, "launch.bench": bench.parse,
+    # imported only here: brax is an extra
+    "examples.brax_ppo": lambda words: options_of(importlib.import_module("examples.brax_ppo").PPOOptions, words)}
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if "results" not in page.parts],

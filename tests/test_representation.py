@@ -312,8 +312,12 @@ def test_the_command_learns_probes_and_keeps(tmp_path, capsys):
     folder = tmp_path / "run" / "seed_3" / "representation"
     assert json.loads((folder / "probe.json").read_text())["domain"] == "heaven_hell"
     load_representation(folder, registry.make("heaven_hell"))
-    assert represent.main(["--domain", "heaven_hell", *options]) == 1
-    assert "already holds a run" in capsys.readouterr().err
+    made = (folder / "representation.msgpack").stat().st_mtime_ns
+    assert represent.main(["--domain", "heaven_hell", *options]) == 0  # goes on where it was: at the end
+    assert "of 1 representations pass" in capsys.readouterr().out
+    assert (folder / "representation.msgpack").stat().st_mtime_ns == made
+    assert represent.main(["--domain", "heaven_hell", *options, "--stage1.lambda-r", "2"]) == 1
+    assert "was made with other options" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("options", [["--domain", "nowhere"], ["--seeds", "x"], ["--seeds", "0"]])

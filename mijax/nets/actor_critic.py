@@ -4,6 +4,7 @@ One convolutional trunk may look at the frames for all of them: then each branch
 trunk's features, and psi is the trunk with the last layer of every memoryless branch.
 """
 
+import abc
 import dataclasses
 from typing import Any, cast
 
@@ -50,7 +51,7 @@ class Encoded:
     heads: tuple[BranchHeads, ...]  # of every memory branch
 
 
-class ActorCritic(nn.Module):
+class ActorCritic(nn.Module, abc.ABC):
     """The heads of the actor and of two critics; what they see is up to the subclasses.
 
     `look` comes first, once for all that follows, then `encode`, then `policy` and `values`.
@@ -78,9 +79,9 @@ class ActorCritic(nn.Module):
         """(N, *observation_shape) -> what the branches see of them."""
         return shown(frames, self.observation_spec)
 
+    @abc.abstractmethod
     def encode(self, tokens: Tokens, deterministic: bool = True) -> Encoded:
         """What the heads see of tokens that `look` has prepared."""
-        raise NotImplementedError
 
     def policy(self, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
         """(N, W) -> (N, A) mean and log standard deviation of the action before squashing."""
@@ -98,15 +99,15 @@ class ActorCritic(nn.Module):
         mean, log_scale = self.policy(encoded.actor)
         return encoded, mean, log_scale, self.values(encoded.critic, mean)
 
+    @abc.abstractmethod
     def initial_state(self, batch: int) -> MemoryState:
         """The memory of `batch` episodes that have not started."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def step(
         self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
     ) -> tuple[MemoryState, jax.Array, jax.Array]:
         """One token for each of (B,) episodes -> new memory, and the policy there: (B, A) twice."""
-        raise NotImplementedError
 
 
 class _WithTrunk(ActorCritic):

@@ -24,9 +24,10 @@ import numpy as np
 
 from configs.paper import STEPS
 from envs_mjx import registry
+from envs_mjx.base import ContinuousActions
 from launch.experiments import DOMAINS, EXPERIMENTS, Arm
 from mijax import episode, evaluate, figures, runtime, stage1, tables, train
-from mijax.agents.variants import needs_representation, stage1_of
+from mijax.agents.variants import needs_representation, stage1_of, unread_groups
 from mijax.config import Config, ConfigError, Stage1Config, config_from_dict, parse_seeds, require
 from mijax.learner import make_learner
 from mijax.metrics import RunError, RunFolder
@@ -105,11 +106,14 @@ def finish(options: train.TrainOptions) -> RunFolder:
 
 
 def check_same(run: RunFolder, options: train.TrainOptions) -> None:
-    """Raise `RunError` if a run was made with other options than it would be now."""
+    """Raise `RunError` if a run was made with other options than it would be now, as far as its agent reads them."""
     stored = {name: value for name, value in run.config().items() if name not in ("seed_list", "track")}
     there, wanted = (_flat(dataclasses.asdict(config)) for config in (config_from_dict(stored), options.config))
     free = ("memory", "seeds.strategy")  # resolved from `auto` when stored; not meant to change what is learnt
-    other = [name for name, value in wanted.items() if there[name] != value and name not in free]
+    actions = registry.make(options.config.domain).action_spec
+    unread = unread_groups(options.config, continuous=isinstance(actions, ContinuousActions))
+    other = [name for name, value in wanted.items()
+             if there[name] != value and name not in free and name.split(".")[0] not in unread]
     if other:
         raise RunError(f"{run.path}: was made with --{other[0].replace('_', '-')} {there[other[0]]}, wanted "
                        f"{wanted[other[0]]}; choose another --out")

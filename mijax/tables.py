@@ -161,7 +161,7 @@ def _finite(*scores: np.ndarray) -> list[np.ndarray]:
 
 def comparison_markdown(runs: Sequence[ReportedRun]) -> str:
     """`comparison_table` for reading."""
-    lines = []
+    lines, first = [], _plain(runs[0].label)
     for line in comparison_table(runs):
         cells = {"run": line["run"], "seeds": str(line["seeds"])}
         for name in ("success", "return", "reveals", "area"):
@@ -171,7 +171,7 @@ def comparison_markdown(runs: Sequence[ReportedRun]) -> str:
         if "success_iqm" in line:
             cells |= {"success, IQM": readable(line["success_iqm"]), "area, IQM": readable(line.get("area_iqm"))}
         cells["solved"] = f"{line['solved']}/{line['seeds']}"
-        for name, title in (("area", "P(ours better), area"), ("steps", "P(ours better), steps to solve")):
+        for name, title in (("area", f"P({first} better), area"), ("steps", f"P({first} better), steps to solve")):
             if f"p_{name}" in line:
                 low, high = readable(line[f"p_{name}_low"]), readable(line[f"p_{name}_high"])
                 cells[title] = f"{readable(line[f'p_{name}'])} [{low}, {high}]"

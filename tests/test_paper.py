@@ -1,5 +1,6 @@
 """The paper's experiments: which runs they need, that they never make one twice, and their figures and tables."""
 
+import dataclasses
 import pathlib
 
 import numpy as np
@@ -9,7 +10,7 @@ from PIL import Image
 from launch import paper
 from launch.experiments import AGENTS, DOMAINS, EXPERIMENTS, ablations, memories, overlap, parts
 from mijax import tables
-from mijax.metrics import RunFolder
+from mijax.metrics import RunError, RunFolder
 from mijax.results import ReportedRun
 
 TINY = (
@@ -59,6 +60,18 @@ def test_who_looks_through_whose_features() -> None:
     assert len({str(config) for config in trained}) == len(trained) == 6
 
 
+def test_only_what_an_agent_reads_must_be_the_same(tmp_path: pathlib.Path) -> None:
+    request = paper.Request(tmp_path, None, (0,), None, ())
+    options = request.parse("heaven_hell", AGENTS[1])
+    stored = dataclasses.asdict(options.config) | {"seed_list": [0]}
+    others = {"believer": {"samples": 3}, "sac": {"discount": 0.5}, "stage1": {"epochs": 3}}
+    run = RunFolder.create(tmp_path / "run", stored | {name: stored[name] | group for name, group in others.items()})
+    paper.check_same(run, options)
+    run = RunFolder.create(tmp_path / "other", stored | {"dqn": stored["dqn"] | {"discount": 0.5}})
+    with pytest.raises(RunError, match=r"--dqn\.discount 0\.5, wanted 0\.97"):
+        paper.check_same(run, options)
+
+
 def command(out: pathlib.Path) -> list[str]:
     """The options that all runs here share."""
     return ["--domain", "heaven_hell", "--steps", "400", "--out", str(out), *TINY]
@@ -82,7 +95,7 @@ def contents(out: pathlib.Path) -> dict[pathlib.Path, tuple[int, int]]:
 def test_an_experiment_leaves_its_figure_and_table(done: pathlib.Path) -> None:
     text = (done / "fig5.md").read_text()
     assert "1 seed, 400 steps (paper: 5 seeds, 500,000 steps)" in text
-    assert "P(ours better), area" in text
+    assert "P(Ours better), area" in text
     assert "--steps 400" in text
     with Image.open(done / "fig5.png") as image:
         assert min(image.size) > 300

@@ -69,6 +69,15 @@ def needs_representation(config: Config) -> bool:
     return declaration.uses_representation or config.sac.trunk == "psi"
 
 
+def unread_groups(config: Config, continuous: bool) -> set[str]:
+    """The groups of options that a configuration's agent never looks at, on SAC where actions are `continuous`."""
+    declaration = variant(config.agent)
+    read = {"dqn": not continuous, "sac": continuous, "information": declaration.uses_representation,
+            "zp": declaration.predicts_itself, "believer": declaration.believes, "mdp": declaration.sees_state,
+            "stage1": needs_representation(config)}
+    return {group for group, is_read in read.items() if not is_read}
+
+
 def memory_of(config: Config) -> MemoryKind:
     """The sequence model that a configuration means."""
     memories = variant(config.agent).memories

@@ -1,7 +1,9 @@
 """One preset per domain. `preset(name)` is what a command starts from; any field can then be changed by its flag."""
 
+import dataclasses
 import importlib
 
+from envs_mjx.registry import plain_name
 from mijax.config import Config
 
 DOMAINS = ("heaven_hell", "sphinx", "carflag_2d")
@@ -11,7 +13,8 @@ ROBOTS = ("block_pulling", "block_pushing", "drawer_opening")
 
 
 def preset(domain: str) -> Config:
-    """The preset of a domain; a domain without one (a user's own) gets the defaults under its name."""
-    if domain not in (*DOMAINS, *ROBOTS):
+    """The preset of a domain, whatever its arguments; one without (a user's own) gets the defaults under its name."""
+    name = plain_name(domain)
+    if name not in (*DOMAINS, *ROBOTS):
         return Config(domain=domain)
-    return importlib.import_module(f"configs.{domain}").CONFIG
+    return dataclasses.replace(importlib.import_module(f"configs.{name}").CONFIG, domain=domain)

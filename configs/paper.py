@@ -3,6 +3,7 @@
 import dataclasses
 
 from configs import ROBOTS
+from envs_mjx.registry import plain_name
 from mijax.config import Config
 
 CRITIC_LEARNING_RATE = {"sphinx": 3e-5, "carflag_2d": 3e-5}
@@ -25,13 +26,14 @@ TABLE_3 = {"sphinx": {"learning_rate": 1e-3},
 
 def paper(config: Config, vector_observation: bool) -> Config:
     """A domain's preset with the paper's networks, losses, schedule, budget and stage 1: 1000 epochs, plain Adam."""
-    steps = STEPS.get(config.domain, 500_000)
+    domain = plain_name(config.domain)
+    steps = STEPS.get(domain, 500_000)
     network = dataclasses.replace(
         config.network, gru_width=128, critic_hidden=(256, 256), actor_hidden=(256, 256), auxiliary_hidden=(128, 128),
         dropout=0.1, action_embedding=64 if vector_observation else 16,
-        observation_embedding=64 if vector_observation or config.domain in ROBOTS else 100)
+        observation_embedding=64 if vector_observation or domain in ROBOTS else 100)
     dqn = dataclasses.replace(
-        config.dqn, learning_rate=CRITIC_LEARNING_RATE.get(config.domain, 3e-4), final_learning_rate=1.0, discount=0.99,
+        config.dqn, learning_rate=CRITIC_LEARNING_RATE.get(domain, 3e-4), final_learning_rate=1.0, discount=0.99,
         trace_decay=0.0, target_rate=0.005, batch_episodes=64, updates_per_step=0.25, warmup_episodes=10,
         epsilon_steps=steps // 10, value_bound=0.0)
     sac = dataclasses.replace(
@@ -39,9 +41,9 @@ def paper(config: Config, vector_observation: bool) -> Config:
         batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0,
         pretrain_updates=0, imitation_weight=0.0)
     information = dataclasses.replace(
-        config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(config.domain, 10.0),
+        config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(domain, 10.0),
         intrinsic_form="cosine")
     stage1 = dataclasses.replace(
-        config.stage1, epochs=EPOCHS, rewarded=0, club_ramp=0.0, phi_shrinkage=0.0, **TABLE_3.get(config.domain, {}))
+        config.stage1, epochs=EPOCHS, rewarded=0, club_ramp=0.0, phi_shrinkage=0.0, **TABLE_3.get(domain, {}))
     return dataclasses.replace(config, steps=steps, network=network, dqn=dqn, sac=sac, information=information,
                                stage1=stage1)

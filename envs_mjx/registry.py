@@ -1,10 +1,13 @@
 """Names of environments, and the check that an environment keeps the contract of `envs_mjx.base`.
 
 An environment of your own needs no registration: `make("package.module:EnvClass")` imports it, also from the current
-directory. `register` gives it a short name.
+directory. `register` gives it a short name. Arguments of the environment follow its name:
+`make("block_pulling,noise=0.007,stop_force=12.5")`.
 """
 
+import ast
 import importlib
+import inspect
 import os
 import sys
 from collections.abc import Callable
@@ -24,7 +27,7 @@ from envs_mjx.base import (
     TimeStep,
 )
 
-Factory = Callable[[], Environment] | str
+Factory = Callable[..., Environment] | str
 """Makes an environment: a callable (a class, say), or "package.module:EnvClass", imported only when it is made."""
 
 
@@ -59,23 +62,62 @@ def names() -> tuple[str, ...]:
     return tuple(_factories)
 
 
-def make(name: str) -> Environment:
-    """The environment registered as `name`, or `EnvClass()` when name is "package.module:EnvClass".
+def plain_name(domain: str) -> str:
+    """What stands before the arguments: "block_pulling" of "block_pulling,noise=0.007"."""
+    return domain.partition(",")[0]
+
+
+def file_name(domain: str) -> str:
+    """The domain as part of a path."""
+    return domain.replace(":", ".")
+
+
+def make(domain: str) -> Environment:
+    """The environment registered as `domain`, or `EnvClass()` when that is "package.module:EnvClass".
+
+    Args:
+        domain: a name, and what its factory is called with: "name,argument=value,..." with numbers, booleans or words.
 
     Raises:
         UnknownDomain: with one line that tells what is accepted.
     """
+    name, arguments = plain_name(domain), _arguments(domain)
     known = _factories.get(name, name if ":" in name else None)
     if known is None:
         raise UnknownDomain(f"unknown domain {name!r}: accepted are {', '.join(names())}, or package.module:EnvClass")
     factory = _import(name, known) if isinstance(known, str) else known
+    _check_arguments(name, factory, arguments)
     try:
-        env = factory()
+        env = factory(**arguments)
     except Exception as error:
-        raise UnknownDomain(f"domain {name!r} cannot be made without arguments: {_one_line(error)}") from error
+        without = "" if arguments else " without arguments"
+        raise UnknownDomain(f"domain {domain!r} cannot be made{without}: {_one_line(error)}") from error
     if not isinstance(env, Environment):
         raise UnknownDomain(f"domain {name!r} makes a {type(env).__name__}, not an envs_mjx.base.Environment")
     return env
+
+
+def _arguments(domain: str) -> dict[str, Any]:
+    arguments = {}
+    for part in domain.split(",")[1:]:
+        argument, equals, value = part.partition("=")
+        if not (argument.isidentifier() and equals and value):
+            raise UnknownDomain(f"domain {domain!r}: got {part!r}, accepted: name,argument=value,...")
+        try:
+            arguments[argument] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            arguments[argument] = value  # a word
+    return arguments
+
+
+def _check_arguments(name: str, factory: Callable[..., object], arguments: dict[str, Any]) -> None:
+    if not arguments:
+        return
+    accepted = inspect.signature(factory).parameters
+    unknown = [argument for argument in arguments if argument not in accepted]
+    if unknown:
+        raise UnknownDomain(
+            f"domain {name!r}: unknown argument {unknown[0]!r}, accepted: {', '.join(accepted) or 'none'}")
 
 
 def _import(name: str, path: str) -> Callable[[], object]:

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import configs
+from envs_mjx.registry import plain_name
 from mijax.agents.variants import VARIANTS, stage1_of
 from mijax.config import Config
 from mijax.figures import display_name
@@ -46,7 +47,7 @@ AGENTS = (
 
 def agents(domain: str) -> dict[str, tuple[Arm, ...]]:
     """Fig. 3: every agent, under its name on the domain's algorithm."""
-    if domain not in configs.ROBOTS:
+    if plain_name(domain) not in configs.ROBOTS:
         return {display_name(domain): AGENTS}
     return {display_name(domain): tuple(dataclasses.replace(arm, label=VARIANTS[arm.name].title_sac) for arm in AGENTS)}
 

@@ -94,7 +94,7 @@ def run_arm(request: Request, domain: str, arm: Arm) -> list[RunFolder]:
 
 def folder_of(request: Request, domain: str, arm: Arm, options: train.TrainOptions) -> pathlib.Path:
     """Where an arm's runs of this many steps are."""
-    return request.out / "runs" / domain.replace(":", ".") / f"{arm.name}-{options.config.steps}"
+    return request.out / "runs" / registry.file_name(domain) / f"{arm.name}-{options.config.steps}"
 
 
 def finish(options: train.TrainOptions) -> RunFolder:
@@ -134,7 +134,7 @@ def features_of(arm: Arm, config: Config) -> str | None:
 
 def shared_features(request: Request, domain: str, features: str, options: train.TrainOptions) -> pathlib.Path:
     """The run of that stage 1, with every seed that was asked for."""
-    config, path = options.config, request.out / "runs" / domain.replace(":", ".") / f"features-{features}"
+    config, path = options.config, request.out / "runs" / registry.file_name(domain) / f"features-{features}"
     if (path / "config.json").exists():
         run = RunFolder.open(path)
         if Stage1Config(**run.config()["stage1"]) != config.stage1:
@@ -164,7 +164,7 @@ def note_on(request: Request, domains: Sequence[str], steps: dict[str, int]) -> 
     """What a figure says of budgets: its own, and the paper's where that is larger."""
     parts = []
     for domain in domains:
-        own, paper = steps[domain], STEPS.get(domain, 0)
+        own, paper = steps[domain], STEPS.get(registry.plain_name(domain), 0)
         shrunk = own < paper or len(request.seeds) < PAPER_SEEDS
         parts.append(f"{figures.display_name(domain)}: {len(request.seeds)} seed{'s' * (len(request.seeds) > 1)}, "
                      f"{own:,} steps" + (f" (paper: {PAPER_SEEDS} seeds, {paper:,} steps)" if shrunk and paper else ""))
@@ -246,7 +246,7 @@ def run_intrinsic(name: str, request: Request, domains: Sequence[str]) -> None:
                     index = int(informed[0]) if len(informed) else 0
                     drawn.append((domain, config.information.intrinsic_weight, seen, index))
                     episode.draw_episode(
-                        seen, index, learner.domain, request.out / f"{name}_{domain.replace(':', '.')}.png",
+                        seen, index, learner.domain, request.out / f"{name}_{registry.file_name(domain)}.png",
                         weight=config.information.intrinsic_weight,
                         title=f"{figures.display_name(domain)}, seed {seed}, step {step:,}")
         note = note_on(request, list(steps), steps)

@@ -366,7 +366,7 @@ class Config:
     """A whole run."""
 
     domain: str = "heaven_hell"
-    """A registered environment, or `package.module:EnvClass`."""
+    """A registered environment, or `package.module:EnvClass`; its arguments may follow: `name,argument=value,...`."""
     agent: str = "mi"
     """mi (ours), base (DTQN or TSAC), zp, ba, ua, believer or mdp: see mijax.agents.variants."""
     memory: MemoryName = "auto"

@@ -183,7 +183,7 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
         evaluate_robot.evaluate_random(options.domain, options.episodes, print)
         return None
     if options.domain is not None:
-        out = options.out or pathlib.Path("runs") / f"{options.domain.replace(':', '.')}-planner"
+        out = options.out or pathlib.Path("runs") / f"{registry.file_name(options.domain)}-planner"
         libraries = options.viewer_libraries if options.html else None
         evaluate_robot.evaluate_planner(options.domain, options.episodes, out, options.gif, libraries, print)
         return None

@@ -153,9 +153,12 @@ PAPER_NAMES = {
 
 def display_name(domain: str) -> str:
     """A domain as titles show it: in the paper's spelling where it has one."""
-    if domain in PAPER_NAMES:
-        return PAPER_NAMES[domain]
-    return domain.rpartition(":")[2] if ":" in domain else domain.replace("_", " ").title()
+    name, _, arguments = domain.partition(",")
+    if name in PAPER_NAMES:
+        shown = PAPER_NAMES[name]
+    else:
+        shown = name.rpartition(":")[2] if ":" in name else name.replace("_", " ").title()
+    return f"{shown} ({arguments.replace(',', ', ')})" if arguments else shown
 
 
 def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path, *, title: str, note: str = "",

@@ -31,7 +31,7 @@ class RepresentOptions:
 
     stage1: Stage1Config = dataclasses.field(default_factory=Stage1Config)
     domain: str = "heaven_hell"
-    """A registered environment, or `package.module:EnvClass`."""
+    """A registered environment, or `package.module:EnvClass`; its arguments may follow: `name,argument=value,...`."""
     seeds: Annotated[str, tyro.conf.arg(name="seeds")] = "1"
     """How many seeds (5: seeds 0 to 4), or which ones (3,7; a single one with a comma: 3,)."""
     search: int = 0
@@ -52,7 +52,7 @@ def parse(arguments: Sequence[str]) -> RepresentOptions:
 
 def open_run(options: RepresentOptions, seeds: Sequence[int]) -> RunFolder:
     """A new run folder, or the one that the same command made before it was stopped."""
-    path = options.out or pathlib.Path("runs") / f"{options.domain.replace(':', '.')}-representation"
+    path = options.out or pathlib.Path("runs") / f"{registry.file_name(options.domain)}-representation"
     stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
     if (path / "config.json").exists() and not options.search:
         run = RunFolder.open(path)

@@ -72,7 +72,8 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
         return _resumed(known, others, arguments)
     config = configs.preset(known.domain)
     if known.preset == "paper":
-        robot = known.domain in configs.ROBOTS  # not made here: their physics starts JAX, before its devices are set
+        # Robots are not made here: their physics starts JAX, before its devices are set.
+        robot = registry.plain_name(known.domain) in configs.ROBOTS
         config = paper(config, not robot and not registry.make(known.domain).observation_spec.is_image)
     default = TrainOptions(config=config)
     return tyro.cli(TrainOptions, default=default, args=list(arguments), prog="python -m mijax.train")
@@ -102,7 +103,7 @@ def open_run(options: TrainOptions, fill: Callable[[RunFolder], None] | None = N
             run.extend(config.steps)
         return run
     memory = memory_of(config)
-    name = f"{config.domain.replace(':', '.')}-{config.agent}-{memory}"
+    name = f"{registry.file_name(config.domain)}-{config.agent}-{memory}"
     stored = dataclasses.asdict(config) | {
         "memory": memory, "seed_list": list(parse_seeds(options.seeds)), "track": options.track}
     return RunFolder.create(options.out or pathlib.Path("runs") / name, stored, fill)

@@ -103,7 +103,8 @@ def transfer(options: TransferOptions) -> "dict[str, list[Half]]":
     if options.planner:
         assert options.domain is not None
         evaluate_robot.robot("planner", options.domain)
-        out = options.out or pathlib.Path("runs") / f"{options.domain}-planner" / f"transfer_{options.gap}"
+        folder = f"{registry.file_name(options.domain)}-planner"
+        out = options.out or pathlib.Path("runs") / folder / f"transfer_{options.gap}"
         title = f"{options.domain}, the scripted expert, gap {options.gap}"
         with contextlib.closing(_world(options.domain, options.gap)) as world:
             from envs_mjx.robot.real_trial import ExpertPolicy
@@ -112,7 +113,7 @@ def transfer(options: TransferOptions) -> "dict[str, list[Half]]":
     assert options.run is not None
     run = RunFolder.open(options.run)
     config = evaluate.config_of(run)
-    require(config.domain in evaluate_robot.DEMONSTRATED.split(", "), "run", str(options.run),
+    require(registry.plain_name(config.domain) in evaluate_robot.DEMONSTRATED.split(", "), "run", str(options.run),
             f"a run on a robot task ({evaluate_robot.DEMONSTRATED}), not on {config.domain}")
     present = run.seeds()
     seeds = present if options.seeds is None else parse_seeds(options.seeds)
@@ -179,7 +180,7 @@ def table(rows: "Sequence[Half]") -> str:
 
 
 def _results(rows: "Sequence[Half]", episodes: "Sequence[RealEpisode]") -> dict[str, Any]:
-    from envs_mjx.robot.realworld import OUTCOMES
+    from envs_mjx.robot.task import OUTCOMES
 
     played = [{"outcome": OUTCOMES[episode.outcome], "length": episode.length,
                "touched_first": {-1: None, 0: "immovable", 1: "movable"}[episode.first_touched],
@@ -192,7 +193,8 @@ def _films(
 ) -> None:
     """One film for each way to end; an episode that begins with the immovable object is preferred: it is harder."""
     from envs_mjx.robot.real_trial import frames
-    from envs_mjx.robot.realworld import IMMOVABLE, OUTCOMES
+    from envs_mjx.robot.realworld import IMMOVABLE
+    from envs_mjx.robot.task import OUTCOMES
 
     for outcome in sorted({episode.outcome for episode in episodes}):
         ended = [episode for episode in episodes if episode.outcome == outcome]

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import configs
 from envs_mjx import registry
 from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, EnvState, TimeStep
 from envs_mjx.grid import HeavenHell
@@ -158,6 +159,24 @@ def test_unknown_names() -> None:
         registry.make("builtins:dict")
     with pytest.raises(registry.UnknownDomain, match="cannot be made without arguments"):
         registry.make("envs_mjx.base:DiscreteActions")
+
+
+def test_arguments_follow_the_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Sized(HeavenHell):
+        def __init__(self, size: int = 3, word: str = "", flag: bool = False) -> None:
+            super().__init__()
+            self.given = size, word, flag
+
+    monkeypatch.setattr(registry, "_factories", {"sized": Sized})
+    assert registry.make("sized").given == (3, "", False)  # pyright: ignore[reportAttributeAccessIssue]
+    made = registry.make("sized,size=5,word=deep,flag=True")
+    assert made.given == (5, "deep", True)  # pyright: ignore[reportAttributeAccessIssue]
+    assert configs.preset("heaven_hell,size=5").dqn == configs.preset("heaven_hell").dqn
+    for wrong, message in (("sized,depth=5", "unknown argument 'depth', accepted: size, word, flag"),
+                           ("sized,5", "got '5', accepted: name,argument=value"),
+                           ("sized,size=", "got 'size=', accepted: name,argument=value")):
+        with pytest.raises(registry.UnknownDomain, match=message):
+            registry.make(wrong)
 
 
 def test_environment_of_the_current_directory(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,17 +14,8 @@ from envs_mjx import registry
 from envs_mjx.robot import headless, real_trial, sensors
 from envs_mjx.robot.gap import GAPS, Gap
 from envs_mjx.robot.real_trial import ExpertPolicy, RealEpisode
-from envs_mjx.robot.realworld import (
-    IMMOVABLE,
-    MOVABLE,
-    NOTHING_TOUCHED,
-    OUTCOMES,
-    RUNNING,
-    STOPPED,
-    RealState,
-    RealWorld,
-)
-from envs_mjx.robot.task import SUCCESS, TIME_LIMIT, RobotTask
+from envs_mjx.robot.realworld import IMMOVABLE, MOVABLE, NOTHING_TOUCHED, RealState, RealWorld
+from envs_mjx.robot.task import OUTCOMES, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotTask
 from mijax import transfer
 
 NONE = GAPS["none"]

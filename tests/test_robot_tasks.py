@@ -15,7 +15,7 @@ from envs_mjx import registry
 from envs_mjx.robot import BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
 from envs_mjx.robot.planner import PLANS, Planner, Trajectory
-from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, SUCCESS, TIME_LIMIT, RobotState, RobotTask
+from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotState, RobotTask
 from envs_mjx.robot.trial import policy_trial
 from mijax.demonstrations import demonstrate
 
@@ -128,13 +128,13 @@ def test_draws_are_those_of_the_paper() -> None:
     np.testing.assert_allclose(poses[:, 1, :2] - poses[:, 0, :2], 0.12 * m1, atol=1e-6)
 
 
-# Single steps, eight cubes at once
+# Single steps, ten cubes at once
 
 
 @pytest.fixture(scope="module")
 def pushed() -> tuple[RobotState, RobotState, RobotState]:
-    """Eight situations of Block-Pushing, and what follows after one and after two steps."""
-    env = BlockPushing()
+    """Ten situations of Block-Pushing, and what follows after one and after two steps."""
+    env = BlockPushing(stop_force=12.5)
     base = env.reset(jax.random.key(0))[0]
 
     def situation(gripper, cube, time: int = 0, velocity: float = 0.0) -> RobotState:
@@ -155,10 +155,13 @@ def pushed() -> tuple[RobotState, RobotState, RobotState]:
     situations = [
         situation((0.5, 0.0, 0.2, 0.0), (*far, 0.3), time=49), *map(pushing, range(4)),
         situation((0.5, 0.0, 0.2, 0.0), (*far, 0.3)), situation((0.5, 0.0, 0.2, 0.0), (0.76, 0.0, 0.3)),
-        situation((0.5, 0.0, 0.2, 0.0), (0.5, 0.07, 0.3), velocity=0.0)]
+        situation((0.5, 0.0, 0.2, 0.0), (0.5, 0.07, 0.3), velocity=0.0),
+        # A finger above the other cube, low and high.
+        *(situation((0.644, 0.18, height, 0.0), (*far, 0.3)) for height in (0.065, 0.12))]
     situations[7] = dataclasses.replace(situations[7], qpos=situations[7].qpos.at[5].set(0.09))
     actions = jnp.array([[1.0, -1.0, 0.5, 1.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0],
-                         [1.0, 0.0, 0.0, 0.0], [jnp.nan, 0.0, 0.0, 0.0], [0.0] * 4, [0.0] * 4])
+                         [1.0, 0.0, 0.0, 0.0], [jnp.nan, 0.0, 0.0, 0.0], [0.0] * 4, [0.0] * 4,
+                         [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
     before = jax.tree.map(lambda *x: jnp.stack(x), *situations)
     step = jax.jit(jax.vmap(lambda s, a: env.step(jax.random.key(0), s, a)[0]))
     after = step(before, actions)
@@ -200,11 +203,12 @@ def test_what_is_not_finite_ends_the_episode_and_stays_out(pushed) -> None:
 
 def test_endings(pushed) -> None:
     env, after = BlockPushing(), pushed[1]
-    np.testing.assert_array_equal(after.outcome, [TIME_LIMIT, *[RUNNING] * 4, NOT_FINITE, LEFT, SUCCESS])
+    np.testing.assert_array_equal(
+        after.outcome, [TIME_LIMIT, *[RUNNING] * 4, NOT_FINITE, LEFT, SUCCESS, STOPPED, RUNNING])
     shown = jax.vmap(env.show)(after)
-    np.testing.assert_array_equal(shown.reward, [0, 0, 0, 0, 0, 0, 0, 1])
-    np.testing.assert_array_equal(shown.terminated, [0, 0, 0, 0, 0, 1, 1, 1])
-    np.testing.assert_array_equal(shown.truncated, [1, 0, 0, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(shown.reward, [0, 0, 0, 0, 0, 0, 0, 1, 0, 0])
+    np.testing.assert_array_equal(shown.terminated, [0, 0, 0, 0, 0, 1, 1, 1, 1, 0])
+    np.testing.assert_array_equal(shown.truncated, [1, 0, 0, 0, 0, 0, 0, 0, 0, 0])
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(shown))
 
 

@@ -9,17 +9,8 @@ import numpy as np
 
 from envs_mjx.robot import film
 from envs_mjx.robot.planner import Planner
-from envs_mjx.robot.realworld import (
-    IMMOVABLE,
-    MOVABLE,
-    NOTHING_TOUCHED,
-    OUTCOMES,
-    RUNNING,
-    STOPPED,
-    RealState,
-    RealWorld,
-)
-from envs_mjx.robot.task import SUCCESS, RobotTask
+from envs_mjx.robot.realworld import IMMOVABLE, MOVABLE, NOTHING_TOUCHED, RealState, RealWorld
+from envs_mjx.robot.task import OUTCOMES, RUNNING, STOPPED, SUCCESS, RobotTask
 
 
 class Policy(Protocol):
@@ -71,7 +62,7 @@ class RealEpisode:
 
     @property
     def outcome(self) -> int:
-        """An index into `realworld.OUTCOMES`."""
+        """An index into `task.OUTCOMES`."""
         return self.states[-1].outcome
 
     @property

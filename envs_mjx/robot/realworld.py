@@ -22,16 +22,13 @@ import numpy as np
 
 from envs_mjx.base import Environment, TimeStep
 from envs_mjx.robot import cameras as fusion
-from envs_mjx.robot import sensors, tabletop, task
+from envs_mjx.robot import sensors, tabletop
 from envs_mjx.robot.cameras import Cameras
 from envs_mjx.robot.film import SIDE
 from envs_mjx.robot.gap import Gap
 from envs_mjx.robot.scene import target_of
-from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, SUCCESS, TIME_LIMIT, RobotState, RobotTask
+from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotState, RobotTask
 
-OUTCOMES = (*task.OUTCOMES, "protective stop")
-"""What `RealState.outcome` counts."""
-STOPPED = len(task.OUTCOMES)
 NOTHING_TOUCHED, IMMOVABLE, MOVABLE = -1, 0, 1
 """What `RealState.first_touched` counts."""
 STOP_FORCE = 50.0
@@ -69,7 +66,7 @@ class RealState:
     draw: Draw
     first_touched: int  # by a finger: NOTHING_TOUCHED, IMMOVABLE or MOVABLE
     pressed: float  # N, the largest force downwards so far
-    outcome: int  # an index into `OUTCOMES`
+    outcome: int  # an index into `task.OUTCOMES`
     image_key: jax.Array  # of the cameras' noise at this moment
 
 
@@ -167,7 +164,7 @@ class RealWorld(Environment):
         if outcome == RUNNING and time >= self.horizon:
             outcome = TIME_LIMIT
         robot = dataclasses.replace(robot, time=np.int32(time), touched=np.bool_(touched != NOTHING_TOUCHED),
-                                    outcome=np.int32(min(outcome, STOPPED - 1)))
+                                    outcome=np.int32(outcome))
         return RealState(
             robot=robot, seen=robot if seen is None else seen, physics=self._physics(), draw=env_state.draw,
             first_touched=touched, pressed=pressed, outcome=outcome, image_key=key)

@@ -35,6 +35,8 @@ TIME_STEP = 0.02
 SUBSTEPS = 10
 RAMP_SUBSTEPS = 6
 """The set-point moves evenly over these substeps; the others let the gripper arrive (a test allows 2.5 mm)."""
+_HEIGHT = 2
+"""Of the gripper, among positions and forces."""
 _STIFFNESS, _FORCE = 2500.0, 30.0  # N/m on 1 kg, critically damped; N
 _TURN_STIFFNESS, _TORQUE = 12.5, 3.0  # Nm/rad on 0.005 kg m^2, critically damped; Nm
 _CONTACT = 'solref="0.04 1"'  # the shortest time constant that this time step allows
@@ -123,7 +125,7 @@ class Physics:
     def advance(
         self, poses: jax.Array, qpos: jax.Array, qvel: jax.Array, target: jax.Array,
         solved: Callable[[jax.Array], jax.Array]
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """One environment step: 0.2 s in 10 substeps, or until the task is solved.
 
         Args:
@@ -134,24 +136,26 @@ class Physics:
             solved: (nq,) -> () bool; everything stands still from then on.
 
         Returns:
-            qpos, qvel, and () bool whether a finger touched something on the way.
+            qpos, qvel, () bool whether a finger touched something on the way, and () newtons: the largest force with
+            which the gripper pressed down.
         """
         model, start = self._place(poses), qpos[:4]
 
         def substep(carry: tuple, time: jax.Array) -> tuple[tuple, None]:
-            qpos, qvel, warmstart, over, touched = carry
+            qpos, qvel, warmstart, over, touched, pressed = carry
             control = start + (target - start) * jnp.minimum(time / RAMP_SUBSTEPS, 1.0)
             data = self._data.replace(qpos=qpos, qvel=qvel, ctrl=control, qacc_warmstart=warmstart)
             with _as_mjx_is_written():
                 data = mjx.step(model, data)
             touched |= ~over & self._touches(data)
+            pressed = jnp.where(over, pressed, jnp.maximum(pressed, data.qfrc_constraint[_HEIGHT]))
             qpos, qvel = (jnp.where(over, old, new) for old, new in ((qpos, data.qpos), (qvel, data.qvel)))
-            return (qpos, qvel, data.qacc_warmstart, over | solved(qpos), touched), None
+            return (qpos, qvel, data.qacc_warmstart, over | solved(qpos), touched, pressed), None
 
-        first = (qpos, qvel, jnp.zeros_like(qvel), solved(qpos), jnp.zeros((), bool))
+        first = (qpos, qvel, jnp.zeros_like(qvel), solved(qpos), jnp.zeros((), bool), jnp.zeros(()))
         times = jnp.arange(1, SUBSTEPS + 1, dtype=jnp.float32)
-        (qpos, qvel, _, _, touched), _ = jax.lax.scan(substep, first, times)
-        return qpos, qvel, touched
+        (qpos, qvel, _, _, touched, pressed), _ = jax.lax.scan(substep, first, times)
+        return qpos, qvel, touched, pressed
 
     def _touches(self, data: Any) -> jax.Array:
         """() bool: whether a finger is in contact."""

@@ -23,9 +23,9 @@ from envs_mjx.base import (
 )
 from envs_mjx.robot import depth, noise, rotation, scene, window
 
-OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit")
+OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit", "protective stop")
 """What `RobotState.outcome` counts."""
-RUNNING, SUCCESS, LEFT, NOT_FINITE, TIME_LIMIT = range(5)
+RUNNING, SUCCESS, LEFT, NOT_FINITE, TIME_LIMIT, STOPPED = range(6)
 
 CONTRAST = 0.05
 """Metres: the height of an object, against depths that shift by four times as much when the gripper rises. The fingers,
@@ -56,7 +56,8 @@ class RobotTask(Environment):
     Actions in [-1, 1]^4: (dx, dy, dz) x 5 cm in the world frame and a turn x pi/8. Observation (84, 84, 2) float32: the
     depth image in metres (`envs_mjx.robot.depth`), and zeros. State: the same depth image, and that of the scene
     without the immovable object. An episode ends with reward 1 when the task is solved, and with 0 when a block leaves
-    the workspace, when the simulation is no longer finite (the last finite moment is kept), or after 50 steps.
+    the workspace, when the gripper presses onto an object, if asked for, when the simulation is no longer finite (the
+    last finite moment is kept), or after 50 steps.
     """
 
     horizon = 50
@@ -78,9 +79,20 @@ class RobotTask(Environment):
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 
-    def __init__(self, noise: float = 0.0) -> None:
-        """Args: noise: amplitude of the Perlin noise in the depth image, in metres (paper Appendix E.2: 0.007)."""
-        self.noise = noise
+    def __init__(self, noise: float = 0.0, stop_force: float = 0.0) -> None:
+        """Options that make a policy fit for a robot.
+
+        Args:
+            noise: amplitude of the Perlin noise in the depth image, in metres (paper Appendix E.2: 0.007).
+            stop_force: in newtons; pressing down harder is a protective stop (paper Section 6), which ends the episode
+                with 0. The gripper's height has 2 500 N/m: 12.5 stops it 5 mm too deep. 0: never.
+
+        Raises:
+            ValueError: for a negative number.
+        """
+        if noise < 0 or stop_force < 0:
+            raise ValueError(f"noise {noise}, stop_force {stop_force}: expected numbers >= 0")
+        self.noise, self.stop_force = noise, stop_force
         self.physics = scene.Physics(self.xml(), self.placed)
 
     placed: Sequence[str]
@@ -137,16 +149,19 @@ class RobotTask(Environment):
 
     def step(self, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, TimeStep]:
         """Move the gripper for 0.2 s. The dynamics are deterministic: the key serves the image's noise."""
-        qpos, qvel, touched = self.physics.advance(
+        qpos, qvel, touched, pressed = self.physics.advance(
             self.placed_poses(env_state), env_state.qpos, env_state.qvel, scene.target_of(env_state.qpos, action),
             lambda qpos: self.solved(dataclasses.replace(env_state, qpos=qpos)))
         finite = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
         moved = dataclasses.replace(
             env_state, qpos=jnp.where(finite, qpos, env_state.qpos), qvel=jnp.where(finite, qvel, env_state.qvel),
             touched=env_state.touched | touched, time=env_state.time + 1, noise_key=_noise_key(key))
-        conditions = (~finite, self.solved(moved), self.left_workspace(moved), moved.time >= self.horizon)
+        pressing = pressed > self.stop_force if self.stop_force else jnp.zeros((), bool)
+        late = moved.time >= self.horizon
+        endings = ((NOT_FINITE, ~finite), (SUCCESS, self.solved(moved)), (STOPPED, pressing),
+                   (LEFT, self.left_workspace(moved)), (TIME_LIMIT, late))
         outcome = jnp.int32(RUNNING)
-        for condition, code in reversed(tuple(zip(conditions, (NOT_FINITE, SUCCESS, LEFT, TIME_LIMIT), strict=True))):
+        for code, condition in reversed(endings):
             outcome = jnp.where(condition, jnp.int32(code), outcome)
         moved = dataclasses.replace(moved, outcome=outcome)
         return moved, self.show(moved)
@@ -159,7 +174,7 @@ class RobotTask(Environment):
             observation=observation,
             state=state,
             reward=(outcome == SUCCESS).astype(jnp.float32),
-            terminated=(outcome == SUCCESS) | (outcome == LEFT) | (outcome == NOT_FINITE),
+            terminated=(outcome != RUNNING) & (outcome != TIME_LIMIT),
             truncated=outcome == TIME_LIMIT,
         )
 

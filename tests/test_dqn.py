@@ -236,6 +236,15 @@ def test_acting_sees_no_state():
     assert "state" not in inspect.signature(DQN.explore).parameters
 
 
+def test_the_value_is_the_best_action_s(states: dict[str, AgentState]):
+    agent, params = agent_of(BASE), states["base"].params["agent"]
+    seen = agent.initial_memory(3), jnp.asarray(np.random.default_rng(0).normal(size=(3, 2)), jnp.float32)
+    none = jnp.full((3,), -1, jnp.int32)
+    q = jax.jit(agent.action_values)(params, *seen, none)[1]
+    np.testing.assert_array_equal(jax.jit(agent.value)(params, *seen, none), np.max(q, axis=1))
+    np.testing.assert_array_equal(jax.jit(agent.act)(params, *seen, none)[1], np.argmax(q, axis=1))
+
+
 def test_exploration(states: dict[str, AgentState]):
     agent, num = agent_of(BASE), 3000
     explore = jax.jit(agent.explore)

@@ -7,7 +7,7 @@ import pytest
 
 from envs_mjx import registry
 from mijax.config import Config, NetworkConfig
-from mijax.frames import FrameTable, Patches, take_apart
+from mijax.frames import FrameTable, Patches, keep_present, take_apart
 from mijax.learner import make_learner
 from mijax.nets.encoders import encoder_for
 from mijax.nets.heads import ObservationEmbedder
@@ -20,6 +20,15 @@ def observations(domain: str) -> np.ndarray:
     if listed is None:
         pytest.skip("the environment lists none")
     return listed
+
+
+def test_frames_that_are_there_are_kept_once():
+    index = jnp.array([7, 2, 7, 5, 2])
+    few, present, place = jax.jit(keep_present, static_argnums=(1, 2))(index, 9, 4)
+    assert few
+    np.testing.assert_array_equal(present[:3], [2, 5, 7])
+    np.testing.assert_array_equal(present[place], index)
+    assert not keep_present(index, 9, 2)[0]
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32", "float16", "int32", "bool"])

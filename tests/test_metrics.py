@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mijax import metrics
+from mijax import metrics, runtime
 from mijax.metrics import ProgressDisplay, RunError, RunFolder
 
 CONFIG = {"domain": "heaven_hell", "agent": "mi", "memory": "gpt", "critic_hidden": (256, 256)}
@@ -23,6 +23,22 @@ def one_line(error: pytest.ExceptionInfo[RunError]) -> str:
     message = str(error.value)
     assert "\n" not in message
     return message
+
+
+@pytest.mark.parametrize(("raised", "code", "said"), [
+    (None, 0, ""), (RunError("no such run"), 1, "error: no such run\n"), (KeyboardInterrupt(), 130, "stopped\n")])
+def test_exit_codes(raised: BaseException | None, code: int, said: str, capsys: pytest.CaptureFixture[str]):
+    def work() -> None:
+        if raised is not None:
+            raise raised
+
+    assert runtime.exit_code(work, (RunError,)) == code
+    assert capsys.readouterr().err == said
+
+
+def test_a_mistake_of_ours_is_not_taken_for_the_user_s():
+    with pytest.raises(ZeroDivisionError):
+        runtime.exit_code(lambda: 1 / 0, (RunError,))
 
 
 def test_create_and_open(run):

@@ -12,7 +12,7 @@ from compass import Compass
 from scipy import integrate, stats
 
 from envs_mjx.base import ArraySpec, ContinuousActions, Environment
-from mijax.agents.core import AgentState
+from mijax.agents.core import AgentState, adam
 from mijax.agents.factory import make_agent
 from mijax.agents.sac import SAC, make_sac
 from mijax.agents.variants import VARIANTS, needs_representation, title_of
@@ -303,6 +303,33 @@ def test_step_by_step_equals_the_full_pass(name: str, memory: Any):
         for t in range(first, end):
             state, action = act(agent, state, jnp.asarray(frames[row, t][None]), tokens.previous_action[row, t][None])
             np.testing.assert_allclose(action[0], np.tanh(mean[row, t]), atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["base", "ua"])
+def test_the_value_of_a_beginning(name: str):
+    """The smaller critic's, of the mean action at the first token; unknown where the critics want the state."""
+    case = Case(name)
+    agent, tokens = case.state.params["agent"], case.tokens
+    first = jnp.asarray(tokens.frames).reshape(2, ROW, 2)[:, 0]
+    value = jax.jit(case.sac.value)(agent, case.sac.initial_memory(2), first, tokens.previous_action[:, 0])
+    if name == "ua":
+        assert np.isnan(value).all()
+    else:
+        mean, _, _, _ = case.says(agent, tokens, tokens.previous_action)
+        q = case.says(agent, tokens, jnp.tanh(mean))[2]
+        np.testing.assert_allclose(value, np.asarray(q)[:, :, 0].min(0), atol=2e-5)
+
+
+@pytest.mark.lenient
+def test_the_step_size_falls_over_all_updates():
+    options = SACConfig(learning_rate=0.1, final_learning_rate=0.2, updates_per_step=0.5)
+    optimizer = adam(dataclasses.replace(CONFIG, steps=20), options)  # 10 updates
+    params, moves = jnp.zeros(()), []
+    state = optimizer.init(params)
+    for _ in range(12):
+        move, state = optimizer.update(jnp.ones(()), state, params)
+        moves.append(-float(move))  # Adam moves by its step size where the gradient is always the same
+    np.testing.assert_allclose(moves, [*np.linspace(0.1, 0.02, 11), 0.02], rtol=1e-4)
 
 
 def test_psi_starts_the_trunk_and_every_memoryless_branch():

@@ -223,7 +223,8 @@ class SACConfig:
     pretrain_updates: int = 0
     """Updates on the demonstrations before the agent acts for the first time (paper: 0)."""
     imitation_weight: float = 0.0
-    """Weight of the squared distance between the actor's mean action and a demonstration's (paper: 0)."""
+    """Weight of the loss that brings the actor's mean action near a demonstration's, and its scale to the distance
+    that is left (paper: 0)."""
     imitation_until: float = 1.0
     """Fraction of the run's updates over which that weight falls linearly ..."""
     imitation_final: float = 0.0

@@ -213,10 +213,14 @@ def test_losses_by_hand(name: str, bootstrap: bool, trace_decay: float):
     for part, value in expected.items():
         assert metrics[part] == pytest.approx(value, rel=2e-3, abs=1e-5), part
     if name == "base":
-        moves = np.concatenate([np.tanh(mean)[row, first : end - 1] - taken[row, first : end - 1]
-                                for row, first, end in (SPANS[0], SPANS[2])])
-        expected["loss/imitation"] = np.mean(np.sum(np.square(moves), axis=-1))
-        assert metrics["loss/imitation"] == pytest.approx(expected["loss/imitation"], rel=2e-3)
+        shown = [(row, t) for row, first, end in (SPANS[0], SPANS[2]) for t in range(first, end - 1)]
+        moves = np.array([np.tanh(mean[at]) - taken[at] for at in shown])
+        scales = np.array([log_scale[at] for at in shown])
+        expected["actor/distance"] = np.mean(np.sum(moves**2, axis=-1))
+        misfit = np.mean(np.sum(moves**2 / (2 * np.exp(scales) ** 2) + scales, axis=-1))
+        expected["loss/imitation"] = expected["actor/distance"] + misfit
+        for part in ("actor/distance", "loss/imitation"):
+            assert metrics[part] == pytest.approx(expected[part], rel=2e-3)
     total = 0.6 * expected.get("loss/imitation", 0.0) + expected["loss/td"] + expected["loss/actor"]
     total += np.log(0.3) * (np.mean(entropies) + ACTIONS)
     if name == "mi":  # the auxiliary loss of both branches

@@ -182,9 +182,9 @@ class SAC(Agent):
         loss_actor, log_prob, parts = self._actor(agent, online, log_temperature, tokens, key_action)
         loss, metrics = loss + loss_actor, metrics | parts
         if tokens.demonstrated is not None:
-            loss_imitation = self._imitation(agent, online, tokens)
+            loss_imitation, parts = self._imitation(agent, online, tokens)
             loss += self.imitation_weight(updates) * loss_imitation
-            metrics |= {"loss/imitation": loss_imitation}
+            metrics |= {"loss/imitation": loss_imitation, "actor/distance": parts["distance"]}
         next_action, next_log_prob = self._draw(agent, steady.actor, key_next)
         q_next = jnp.min(self._call("values", target, averaged.critic, next_action), axis=0)
         soft_value = (q_next - jnp.exp(log_temperature) * next_log_prob).reshape(tokens.segment.shape)
@@ -224,11 +224,12 @@ class SAC(Agent):
         loss = sac.actor_loss(log_prob, q, jnp.exp(log_temperature), transitions(tokens))
         return loss, log_prob, {"loss/actor": loss}
 
-    def _imitation(self, agent: Params, online: Encoded, tokens: Tokens) -> jax.Array:
-        mean, _ = self._call("policy", agent, online.actor)
-        action = jnp.tanh(mean).reshape(*tokens.segment.shape, -1)[:, :-1]
-        demonstrated = cast(jax.Array, tokens.demonstrated)[:, :-1]
-        return sac.imitation_loss(action, tokens.previous_action[:, 1:], transitions(tokens) & demonstrated)
+    def _imitation(self, agent: Params, online: Encoded, tokens: Tokens) -> tuple[jax.Array, Metrics]:
+        """The loss over the transitions of demonstrations, and how far the mean is from them."""
+        mean, log_scale = (
+            x.reshape(*tokens.segment.shape, -1)[:, :-1] for x in self._call("policy", agent, online.actor))
+        mask = transitions(tokens) & cast(jax.Array, tokens.demonstrated)[:, :-1]
+        return sac.imitation_loss(jnp.tanh(mean), log_scale, tokens.previous_action[:, 1:], mask)
 
     def _critic(
         self, agent: Params, online: Encoded, soft_value: jax.Array, bonus: jax.Array, tokens: Tokens

@@ -84,10 +84,28 @@ def actor_loss(log_prob: jax.Array, q: jax.Array, temperature: jax.Array, mask: 
     return masked_mean(jax.lax.stop_gradient(temperature) * log_prob - jnp.min(q, axis=0), mask)
 
 
-def imitation_loss(action: jax.Array, demonstrated: jax.Array, mask: jax.Array) -> jax.Array:
-    """E[ |a - a*|^2 ] over the transitions of demonstrations: (..., A), (..., A), (...) bool -> (). Not the paper's."""
-    chex.assert_equal_shape([action, demonstrated])
-    return masked_mean(jnp.sum(jnp.square(action - demonstrated), axis=-1), mask)
+def imitation_loss(
+    action: jax.Array, log_scale: jax.Array, demonstrated: jax.Array, mask: jax.Array
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """E[ |a - a*|^2 + sum_i ( (a_i - a*_i)^2 / (2 sigma_i^2) + log sigma_i ) ] over demonstrations. Not the paper's.
+
+    The actor's mean comes near the demonstrated action, and its scale is fitted to the distance that is left: it
+    explores where demonstrations differ, and is as precise as they are elsewhere. The second part moves the scale only.
+
+    Args:
+        action: (..., A) tanh of the mean.
+        log_scale: (..., A) log sigma, before squashing.
+        demonstrated: (..., A) a*.
+        mask: (...) bool, the transitions of demonstrations.
+
+    Returns:
+        () loss; the mean squared distance.
+    """
+    chex.assert_equal_shape([action, log_scale, demonstrated])
+    square = jnp.square(action - demonstrated)
+    misfit = jax.lax.stop_gradient(square) / 2 * jnp.exp(-2 * log_scale) + log_scale
+    distance = masked_mean(jnp.sum(square, axis=-1), mask)
+    return distance + masked_mean(jnp.sum(misfit, axis=-1), mask), {"distance": distance}
 
 
 def temperature_loss(

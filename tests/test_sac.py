@@ -137,6 +137,18 @@ def test_density_of_the_squashed_gaussian(mean: float, log_scale: float):
         assert float(log_prob) == pytest.approx(np.log(density(float(action[0]))), rel=1e-3, abs=1e-3)
 
 
+def test_imitation_fits_the_scale_to_what_is_left():
+    """Its gradient is 0 where the scale is the distance; the mean's is that of the squared distance alone."""
+    shown, mask = jnp.array([[0.3], [-0.3]]), jnp.ones((2,), bool)
+
+    def loss(action: float, log_scale: float) -> jax.Array:
+        return sac.imitation_loss(jnp.full((2, 1), action), jnp.full((2, 1), log_scale), shown, mask)[0]
+
+    gradients = [float(jax.grad(loss, argnums=1)(0.0, jnp.log(scale))) for scale in (0.2, 0.3, 0.4)]
+    np.testing.assert_allclose(gradients, [0.2**2 - 0.3**2, 0, 0.4**2 - 0.3**2], atol=1e-6)
+    assert float(jax.grad(loss)(0.1, -3.0)) == pytest.approx(2 * 0.1)
+
+
 def test_density_far_in_the_tails_is_finite():
     far = jnp.array([30.0, -30.0], jnp.float32)
     np.testing.assert_allclose(sac.log_slope_of_tanh(far), 2 * np.log(2) - 2 * np.abs(far), rtol=1e-6)
@@ -217,7 +229,8 @@ def test_losses_by_hand(name: str, bootstrap: bool, trace_decay: float):
         moves = np.array([np.tanh(mean[at]) - taken[at] for at in shown])
         scales = np.array([log_scale[at] for at in shown])
         expected["actor/distance"] = np.mean(np.sum(moves**2, axis=-1))
-        misfit = np.mean(np.sum(moves**2 / (2 * np.exp(scales) ** 2) + scales, axis=-1))
+        variances = np.exp(2 * scales)
+        misfit = np.mean(np.sum(variances * (moves**2 / (2 * variances) + scales), axis=-1))
         expected["loss/imitation"] = expected["actor/distance"] + misfit
         for part in ("actor/distance", "loss/imitation"):
             assert metrics[part] == pytest.approx(expected[part], rel=2e-3)

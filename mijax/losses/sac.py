@@ -87,10 +87,12 @@ def actor_loss(log_prob: jax.Array, q: jax.Array, temperature: jax.Array, mask: 
 def imitation_loss(
     action: jax.Array, log_scale: jax.Array, demonstrated: jax.Array, mask: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """E[ |a - a*|^2 + sum_i ( (a_i - a*_i)^2 / (2 sigma_i^2) + log sigma_i ) ] over demonstrations. Not the paper's.
+    """E[ |a - a*|^2 + sum_i sg(sigma_i^2) ( sg(a_i - a*_i)^2 / (2 sigma_i^2) + log sigma_i ) ]. Not the paper's.
 
     The actor's mean comes near the demonstrated action, and its scale is fitted to the distance that is left: it
-    explores where demonstrations differ, and is as precise as they are elsewhere. The second part moves the scale only.
+    explores where demonstrations differ, and is as precise as they are elsewhere. The second part is the beta-NLL of
+    Seitzer et al. (2022) with beta = 1, for the scale alone; sg stops gradients. Without sg(sigma^2) the scale's
+    gradient, up to 1 / sigma^2, drowned the mean's: distances of 0.30 in place of 0.08 (Drawer-Opening, 2 000 updates).
 
     Args:
         action: (..., A) tanh of the mean.
@@ -104,6 +106,7 @@ def imitation_loss(
     chex.assert_equal_shape([action, log_scale, demonstrated])
     square = jnp.square(action - demonstrated)
     misfit = jax.lax.stop_gradient(square) / 2 * jnp.exp(-2 * log_scale) + log_scale
+    misfit *= jax.lax.stop_gradient(jnp.exp(2 * log_scale))
     distance = masked_mean(jnp.sum(square, axis=-1), mask)
     return distance + masked_mean(jnp.sum(misfit, axis=-1), mask), {"distance": distance}
 

@@ -14,7 +14,7 @@ from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.robot import BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
-from envs_mjx.robot.planner import PLANS, Planner, Trajectory
+from envs_mjx.robot.planner import PLANS, Planner, Trajectory, demonstrations
 from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotState, RobotTask
 from envs_mjx.robot.trial import policy_trial
 from mijax.demonstrations import demonstrate
@@ -274,6 +274,38 @@ def test_changing_over() -> None:
         assert chosen == [1] * patience + [0 if changes_over else 1] * 3
         ups = [bool(np.allclose(action, [0, 0, 1, 0])) for action in actions]
         assert ups == [False] * patience + [changes_over] * 2 + [False]
+
+
+def test_a_shaky_expert_sees_where_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is recorded is what was done: the expert's action in the recorded states, and noise. Nothing is touched."""
+    def step(env: RobotTask, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, None]:
+        moved = env_state.qpos.at[:4].set(scene.target_of(env_state.qpos, action))
+        time = env_state.time + 1
+        outcome = jnp.where(time >= env.horizon, TIME_LIMIT, RUNNING)
+        return dataclasses.replace(env_state, qpos=moved, time=time, outcome=outcome), None
+
+    monkeypatch.setattr(DrawerOpening, "step", step)
+    env, noise = DrawerOpening(expert_noise=0.1), 0.1
+    shown = jax.jit(lambda key: demonstrations(env, key, 32))(jax.random.key(0))
+    same = jax.jit(lambda key: jax.lax.map(Planner(env, noise=noise).play, jax.random.split(key, 48), batch_size=16))
+    np.testing.assert_array_equal(shown.actions, same(jax.random.key(0)).actions[:32])  # no success: order is kept
+
+    def intended(states: RobotState, first: jax.Array) -> jax.Array:
+        expert = Planner(env)
+        start = expert.start_with(first, jax.tree.map(lambda x: x[0], states))
+        return jax.lax.scan(lambda memory, state: expert.act(memory, state)[::-1], start, states)[1]
+
+    states = jax.tree.map(lambda x: x[:, :-1], shown.states)
+    meant = np.asarray(jax.jit(jax.vmap(intended))(states, shown.first))
+    free = np.abs(meant) < 0.5  # not cut off at the largest action
+    assert np.std((shown.actions - meant)[free]) == pytest.approx(noise, rel=0.05)
+    assert np.abs(shown.actions).max() <= 1
+
+
+def test_arguments_of_a_task() -> None:
+    assert registry.make("block_pushing,stop_force=12.5,noise=0.007").stop_force == 12.5  # pyright: ignore
+    with pytest.raises(registry.UnknownDomain, match="expected numbers >= 0"):
+        registry.make("block_pushing,expert_noise=-1")
 
 
 @pytest.mark.slow

@@ -78,11 +78,19 @@ class Trajectory:
 class Planner:
     """The expert of a task. `act` is a pure function."""
 
-    def __init__(self, env: RobotTask, changes_over: bool = True) -> None:
-        """Args: changes_over: False gives one that works on its first choice for ever, for comparison."""
+    def __init__(self, env: RobotTask, changes_over: bool = True, noise: float = 0.0) -> None:
+        """How the expert works.
+
+        Args:
+            env: its task.
+            changes_over: False gives one that works on its first choice for ever, for comparison.
+            noise: standard deviation of what is added to its actions in `play`, in fractions of the largest action. It
+                sees what comes of it and makes it good; what is recorded is what was done.
+        """
         self.env = env
         self.plan = PLANS[env.name]
         self.changes_over = changes_over
+        self.noise = noise
 
     def start(self, key: jax.Array, env_state: RobotState) -> PlannerState:
         """Choose an object at random."""
@@ -147,6 +155,9 @@ class Planner:
         def step(carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
             env_state, planner = carry
             action, planner = self.act(planner, env_state)
+            if self.noise:
+                noise = self.noise * jax.random.normal(jax.random.fold_in(key, 1), action.shape)
+                action = jnp.clip(action + noise, -1.0, 1.0)
             env_state, _ = self.env.step(key, env_state, action)
             return (env_state, planner), (env_state, action)
 
@@ -168,7 +179,7 @@ def demonstrations(env: RobotTask, key: jax.Array, number: int = 80, spare: floa
     """
     played = -(-(number + int(number * spare)) // _BATCH) * _BATCH  # whole batches: a partial one is compiled by itself
     keys = jax.random.split(key, played)
-    episodes = jax.lax.map(Planner(env).play, keys, batch_size=_BATCH)
+    episodes = jax.lax.map(Planner(env, noise=env.expert_noise).play, keys, batch_size=_BATCH)
     order = jnp.argsort(~episodes.success, stable=True)[:number]
     return jax.tree.map(lambda x: x[order], episodes)
 

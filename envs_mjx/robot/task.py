@@ -76,23 +76,30 @@ class RobotTask(Environment):
         rate=1 / (scene.TIME_STEP * scene.SUBSTEPS),
     )
     opening: window.Opening
+    expert_noise = 0.0
+    """Standard deviation of what is added to the actions of demonstrations, in fractions of the largest action."""
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 
-    def __init__(self, noise: float = 0.0, stop_force: float = 0.0) -> None:
+    def __init__(self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None) -> None:
         """Options that make a policy fit for a robot.
 
         Args:
             noise: amplitude of the Perlin noise in the depth image, in metres (paper Appendix E.2: 0.007).
             stop_force: in newtons; pressing down harder is a protective stop (paper Section 6), which ends the episode
                 with 0. The gripper's height has 2 500 N/m: 12.5 stops it 5 mm too deep. 0: never.
+            expert_noise: replaces the task's own, if given. With some, demonstrations show what to do after a small
+                error and after an attempt that failed.
 
         Raises:
             ValueError: for a negative number.
         """
-        if noise < 0 or stop_force < 0:
-            raise ValueError(f"noise {noise}, stop_force {stop_force}: expected numbers >= 0")
+        if min(noise, stop_force, expert_noise or 0.0) < 0:
+            raise ValueError(
+                f"noise {noise}, stop_force {stop_force}, expert_noise {expert_noise}: expected numbers >= 0")
         self.noise, self.stop_force = noise, stop_force
+        if expert_noise is not None:
+            self.expert_noise = expert_noise
         self.physics = scene.Physics(self.xml(), self.placed)
 
     placed: Sequence[str]

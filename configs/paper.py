@@ -39,7 +39,7 @@ def paper(config: Config, vector_observation: bool) -> Config:
     sac = dataclasses.replace(
         config.sac, learning_rate=3e-4, final_learning_rate=1.0, discount=0.99, trace_decay=0.0, target_rate=0.005,
         batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0,
-        pretrain_updates=0, imitation_weight=0.0)
+        pretrain_updates=0, imitation_weight=0.0, rotated_copies=4, replay_steps=100_000)
     information = dataclasses.replace(
         config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(domain, 10.0),
         intrinsic_form="cosine")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,8 +64,8 @@ def test_who_looks_through_whose_features() -> None:
 def test_only_what_an_agent_reads_must_be_the_same(tmp_path: pathlib.Path) -> None:
     request = paper.Request(tmp_path, None, (0,), None, ())
     options = request.parse("heaven_hell", AGENTS[1])
-    stored = dataclasses.asdict(options.config) | {"seed_list": [0]}
-    others = {"believer": {"samples": 3}, "sac": {"discount": 0.5}, "stage1": {"epochs": 3}}
+    stored: dict[str, Any] = dataclasses.asdict(options.config) | {"seed_list": [0]}
+    others: dict[str, dict[str, Any]] = {"believer": {"samples": 3}, "sac": {"discount": 0.5}, "stage1": {"epochs": 3}}
     run = RunFolder.create(tmp_path / "run", stored | {name: stored[name] | group for name, group in others.items()})
     paper.check_same(run, options)
     run = RunFolder.create(tmp_path / "other", stored | {"dqn": stored["dqn"] | {"discount": 0.5}})

@@ -14,7 +14,7 @@ from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.robot import BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
-from envs_mjx.robot.planner import PLANS, Planner, Trajectory, demonstrations
+from envs_mjx.robot.planner import PLANS, Planner, PlannerState, Trajectory, demonstrations
 from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotState, RobotTask
 from envs_mjx.robot.trial import policy_trial
 from mijax.demonstrations import demonstrate
@@ -293,7 +293,12 @@ def test_a_shaky_expert_sees_where_it_went(monkeypatch: pytest.MonkeyPatch) -> N
     def intended(states: RobotState, first: jax.Array) -> jax.Array:
         expert = Planner(env)
         start = expert.start_with(first, jax.tree.map(lambda x: x[0], states))
-        return jax.lax.scan(lambda memory, state: expert.act(memory, state)[::-1], start, states)[1]
+
+        def act(memory: PlannerState, state: RobotState) -> tuple[PlannerState, jax.Array]:
+            action, memory = expert.act(memory, state)
+            return memory, action
+
+        return jax.lax.scan(act, start, states)[1]
 
     states = jax.tree.map(lambda x: x[:, :-1], shown.states)
     meant = np.asarray(jax.jit(jax.vmap(intended))(states, shown.first))

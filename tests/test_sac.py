@@ -345,7 +345,7 @@ def test_the_step_size_falls_over_all_updates():
     state = optimizer.init(params)
     for _ in range(12):
         move, state = optimizer.update(jnp.ones(()), state, params)
-        moves.append(-float(move))  # Adam moves by its step size where the gradient is always the same
+        moves.append(-np.asarray(move))  # Adam moves by its step size where the gradient is always the same
     np.testing.assert_allclose(moves, [*np.linspace(0.1, 0.02, 11), 0.02], rtol=1e-4)
 
 

@@ -33,6 +33,7 @@ class DrawerOpening(RobotTask):
 
     name = "drawer_opening"
     opening = window.CLOSED
+    expert_noise = 0.2
     placed = ("loose", "fixed")
 
     def xml(self, visual: bool = False) -> str:

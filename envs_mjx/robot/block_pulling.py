@@ -21,6 +21,7 @@ class BlockPulling(BlockTask):
 
     name = "block_pulling"
     opening = window.OPEN
+    expert_noise = 0.2
     block = Block(side=0.10, height=0.05, mass=0.5, friction=0.5)
     reach = 0.0
     blocks_collide = False  # the episode ends when they touch

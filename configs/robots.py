@@ -24,7 +24,7 @@ from mijax.config import (
 
 def robot(
     domain: str, copies: int, epochs: int, lambda_club: float = 0.3, trunk: TrunkKind = "psi",
-    updates_per_step: float = 0.5,
+    updates_per_step: float = 0.5, imitation_final: float = 0.1,
 ) -> Config:
     """The preset of a robot task.
 
@@ -35,6 +35,7 @@ def robot(
         lambda_club: at its full weight; 0.3 left nothing of z_s in Block-Pushing.
         trunk: what looks at frames (`SACConfig`).
         updates_per_step: fewer where the trunk learns too, at six times the cost.
+        imitation_final: what imitation fades to.
     """
     return Config(
         domain=domain,
@@ -48,7 +49,7 @@ def robot(
         sac=SACConfig(trunk=trunk, learning_rate=1e-3, final_learning_rate=0.05, trace_decay=0.8, target_rate=0.01,
                       updates_per_step=updates_per_step, replay_steps=50_000, demonstrations=80,
                       demonstration_share=0.25, pretrain_updates=2000, imitation_weight=2.0, imitation_until=0.5,
-                      imitation_final=0.1, rotated_copies=24),
+                      imitation_final=imitation_final, rotated_copies=24),
         zp=SelfPredictionConfig(weight=0.1),
         # The paper's weight of 0.1 paid up to 0.35 for an episode of moving about, as z_s holds what moves too: a
         # solved agent went back from 1.0 to 0.44 within 10 000 steps.

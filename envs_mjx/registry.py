@@ -113,7 +113,12 @@ def _arguments(domain: str) -> dict[str, Any]:
 def _check_arguments(name: str, factory: Callable[..., object], arguments: dict[str, Any]) -> None:
     if not arguments:
         return
-    accepted = inspect.signature(factory).parameters
+    try:
+        accepted = inspect.signature(factory).parameters
+    except ValueError:  # of a built-in, which says itself what it takes
+        return
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in accepted.values()):
+        return
     unknown = [argument for argument in arguments if argument not in accepted]
     if unknown:
         raise UnknownDomain(

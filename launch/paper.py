@@ -65,7 +65,7 @@ class Request:
         return train.parse(("--domain", domain, *arm.options, *steps, *self.extra))
 
 
-class Stopped(Exception):
+class Stopped(KeyboardInterrupt):
     """Ctrl-C: what is there is whole, the same command goes on."""
 
 
@@ -312,8 +312,8 @@ def parse(arguments: Sequence[str]) -> tuple[str, Request]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
-    try:
+    """The command; returns its exit code."""
+    def work() -> None:
         what, request = parse(sys.argv[1:] if arguments is None else arguments)
         runtime.prepare(host_devices=min(runtime.cores(), len(request.seeds)))
         if request.domain is not None:
@@ -322,13 +322,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, domains in plan(what, request.domain):
             SAY(f"== {name}: {EXPERIMENTS[name].title}: {', '.join(domains)}")
             (run_intrinsic if name == "fig32" else run_curves)(name, request, domains)
-    except train.USER_ERRORS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except Stopped as stopped:
-        print(stopped)
-        return 130
-    return 0
+
+    return runtime.exit_code(work, train.USER_ERRORS)
 
 
 if __name__ == "__main__":

@@ -135,31 +135,31 @@ class ReportOptions:
     """Whose episode; default: the run's first seed."""
 
 
+def draw(options: ReportOptions) -> None:
+    """Write what was asked for, and say where it is."""
+    if not options.runs:
+        raise RunError("runs: got none, accepted: one run folder or more")
+    if options.smooth < 1:
+        raise RunError(f"--smooth: got {options.smooth}, accepted: a number >= 1")
+    if options.episode and options.html:
+        raise RunError("--html: got it with --episode, accepted: one of them; the page has episodes too")
+    if options.episode or options.html:
+        runtime.prepare()
+    if options.episode:
+        print(f"Written to {report_episode(options)}")
+        return
+    out = options.out or (options.runs[0] if len(options.runs) == 1 else pathlib.Path("runs/report"))
+    runs = load(options.runs, options.labels)
+    print(write_report(runs, out, smooth=options.smooth, note=options.note))
+    if options.html:
+        report_page(runs, out / page.FILE, options)
+    print(f"Written to {out / page.FILE if options.html else out}")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = tyro.cli(ReportOptions, args=arguments, prog="python -m mijax.report")
-    try:
-        if not options.runs:
-            raise RunError("runs: got none, accepted: one run folder or more")
-        if options.smooth < 1:
-            raise RunError(f"--smooth: got {options.smooth}, accepted: a number >= 1")
-        if options.episode and options.html:
-            raise RunError("--html: got it with --episode, accepted: one of them; the page has episodes too")
-        if options.episode or options.html:
-            runtime.prepare()
-        if options.episode:
-            print(f"Written to {report_episode(options)}")
-            return 0
-        out = options.out or (options.runs[0] if len(options.runs) == 1 else pathlib.Path("runs/report"))
-        runs = load(options.runs, options.labels)
-        print(write_report(runs, out, smooth=options.smooth, note=options.note))
-        if options.html:
-            report_page(runs, out / page.FILE, options)
-        print(f"Written to {out / page.FILE if options.html else out}")
-    except USER_ERRORS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return runtime.exit_code(lambda: draw(options), USER_ERRORS)
 
 
 if __name__ == "__main__":

@@ -44,11 +44,12 @@ def release_memory() -> None:
 
 
 def exit_code(work: Callable[[], object], user_errors: tuple[type[BaseException], ...]) -> int:
-    """0 once a command's work is done; 1 after one line on what the user can mend; 130 after Ctrl-C."""
+    """0 once a command's work is done; 1 after one line on what the user can mend; 130 after Ctrl-C, whose exception
+    may say how to go on."""
     try:
         work()
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
+    except KeyboardInterrupt as stopped:
+        print(str(stopped) or "stopped", file=sys.stderr)
         return 130
     except user_errors as error:
         print(f"error: {error}", file=sys.stderr)

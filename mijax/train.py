@@ -22,7 +22,7 @@ from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
-from mijax.learner import make_learner
+from mijax.learner import Learner, make_learner
 from mijax.metrics import ProgressDisplay, RunError, RunFolder, TrackerName, make_tracker
 from mijax.representation import DivergenceError
 from mijax.representation.storage import RepresentationError
@@ -194,8 +194,20 @@ def _start(
         say(f"going on from step {step:,}")
     else:
         run.truncate_after(-1)
+        say(f"stage 2: compiling, then {_prelude(runner.learner)}")
         runner.init(learnt)
         runtime.release_memory()
+
+
+def _prelude(learner: Learner) -> str:
+    """What comes before the first evaluation, which on a robot takes minutes."""
+    config, parts = learner.config, []
+    if learner.demonstrations:
+        parts.append(f"{learner.demonstrations} demonstrations and {config.sac.pretrain_updates:,} updates on them")
+    if learner.agent.declaration.believes:
+        parts.append(f"{config.believer.updates:,} updates of the history model")
+    parts.append(f"{learner.warmup_steps:,} random steps")
+    return ", ".join(parts)
 
 
 def _loop(

@@ -179,6 +179,18 @@ def test_arguments_follow_the_name(monkeypatch: pytest.MonkeyPatch) -> None:
             registry.make(wrong)
 
 
+def test_arguments_of_factories_that_do_not_list_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    def any_size(**options: int) -> HeavenHell:
+        assert options == {"size": 5}
+        return HeavenHell()
+
+    monkeypatch.setattr(registry, "_factories", {"any": any_size, "dict": dict, "max": max})
+    assert isinstance(registry.make("any,size=5"), HeavenHell)
+    for domain, message in (("dict,size=5", "makes a dict"), ("max,size=5", "cannot be made: TypeError")):
+        with pytest.raises(registry.UnknownDomain, match=message):
+            registry.make(domain)
+
+
 def test_environment_of_the_current_directory(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_worlds.py").write_text(
         "from envs_mjx.grid import HeavenHell\nclass Mine(HeavenHell):\n    name = 'mine'\n")

@@ -141,7 +141,7 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, message
     monkeypatch.chdir(tmp_path)
     make_run(tmp_path / "a")
     RunFolder.create(tmp_path / "empty", {"domain": "sphinx", "agent": "mi", "memory": "gpt"})
-    assert report.main(arguments) == 2
+    assert report.main(arguments) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1

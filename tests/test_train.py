@@ -113,6 +113,8 @@ def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path) -> 
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=120)
     assert process.returncode == 0
+    assert "stage 2: compiling, then " in said
+    assert "random steps" in said
     assert f"--resume {path}" in said
     steps = [int(p.name) for p in (path / "seed_0" / "checkpoints").iterdir() if p.name.isdigit()]
     assert max(steps) == RunFolder.open(path).metrics(0)[-1]["step"]

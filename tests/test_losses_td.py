@@ -1,4 +1,4 @@
-"""Double-DQN targets and loss against plain loops."""
+"""Targets and the Double-DQN loss against plain loops."""
 
 import subprocess
 import sys
@@ -10,8 +10,10 @@ import pytest
 
 from mijax.losses import td
 from mijax.losses.masks import masked_mean
+from mijax.losses.returns import traced_returns
 
-watkins_returns = jax.jit(td.watkins_returns)
+returns_of = jax.jit(traced_returns)
+
 
 def backward_loop(reward: np.ndarray, discount: np.ndarray, value: np.ndarray, trace: np.ndarray) -> np.ndarray:
     """G_{t-1} = r_t + discount_t ((1 - trace_t) v_t + trace_t G_t), one row and one step at a time."""
@@ -40,29 +42,29 @@ def test_double_q_value_takes_the_target_of_the_online_choice():
 
 
 @pytest.mark.parametrize("shape", [(1,), (5, 13), (2, 3, 6)])
-def test_watkins_returns_equal_a_backward_loop(shape: tuple[int, ...]):
+def test_returns_equal_a_backward_loop(shape: tuple[int, ...]):
     inputs = random_transitions(np.random.default_rng(0), shape)
-    got = watkins_returns(*map(jnp.asarray, inputs))
+    got = returns_of(*map(jnp.asarray, inputs))
     np.testing.assert_allclose(got, backward_loop(*inputs), rtol=1e-5, atol=1e-5)
 
 
-def test_watkins_returns_of_packed_segments_do_not_mix():
+def test_returns_of_packed_segments_do_not_mix():
     """Two episodes in one row: a trace of 0 on the last transition of the first keeps the second one out."""
     inputs = random_transitions(np.random.default_rng(1), (1, 8))
     inputs[3][:, 3] = 0
-    whole = watkins_returns(*map(jnp.asarray, inputs))
+    whole = returns_of(*map(jnp.asarray, inputs))
     for part in (slice(0, 4), slice(4, 8)):
-        alone = watkins_returns(*(jnp.asarray(x[:, part]) for x in inputs))
+        alone = returns_of(*(jnp.asarray(x[:, part]) for x in inputs))
         np.testing.assert_allclose(whole[:, part], alone, rtol=1e-6)
 
 
 def test_without_traces_the_return_is_the_one_step_target():
     reward, discount, value = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0]), jnp.array([8.0, 9.0])
-    assert td.watkins_returns(reward, discount, value, jnp.zeros(2)).tolist() == [5.0, 2.0]
+    assert traced_returns(reward, discount, value, jnp.zeros(2)).tolist() == [5.0, 2.0]
 
 
 def test_with_full_traces_the_return_is_the_discounted_sum():
-    got = td.watkins_returns(jnp.ones(3), jnp.array([0.5, 0.5, 0.0]), jnp.full(3, 99.0), jnp.array([1.0, 1.0, 0.0]))
+    got = traced_returns(jnp.ones(3), jnp.array([0.5, 0.5, 0.0]), jnp.full(3, 99.0), jnp.array([1.0, 1.0, 0.0]))
     assert got.tolist() == [1.75, 1.5, 1.0]
 
 
@@ -93,9 +95,9 @@ def test_shapes_that_would_broadcast_are_errors():
     with pytest.raises(AssertionError):
         td.double_q_value(jnp.zeros((3, 2)), jnp.zeros((1, 2)))
     with pytest.raises(AssertionError):
-        td.watkins_returns(row, row, row, column)
+        traced_returns(row, row, row, column)
     with pytest.raises(AssertionError):
-        td.watkins_returns(row, jnp.zeros((1, 1)), row, row)
+        traced_returns(row, jnp.zeros((1, 1)), row, row)
     for arguments in ((q, action, column, mask), (q, action, row, mask.T), (q, action.T, row, mask),
                       (q[:, :1], action, row, mask), (q[0], action, row, mask)):
         with pytest.raises((AssertionError, ValueError)):

@@ -296,6 +296,11 @@ def transitions(tokens: Tokens) -> jax.Array:
     return (tokens.segment[:, :-1] == tokens.segment[:, 1:]) & (tokens.segment[:, 1:] > 0)
 
 
+def may_follow(followed: jax.Array) -> jax.Array:
+    """(R, L - 1) float32: 1 where the return of a transition may go on through the next one, which is `followed`."""
+    return jnp.pad(followed[:, 1:].astype(jnp.float32), ((0, 0), (0, 1)))
+
+
 def episode_mean(x: jax.Array, valid: jax.Array, tokens: Tokens) -> jax.Array:
     """() the sum of `x` over the `valid` transitions of an episode, both (R, L - 1), on average."""
     episodes = jnp.sum((tokens.position == 0) & (tokens.segment > 0), dtype=jnp.float32)

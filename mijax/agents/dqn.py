@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from envs_mjx.base import DiscreteActions, Environment
-from mijax.agents.core import Agent, AgentState, Heads, adam, episode_mean, transitions
+from mijax.agents.core import Agent, AgentState, Heads, adam, episode_mean, may_follow, transitions
 from mijax.agents.variants import Variant, memory_of, variant
 from mijax.config import Config, ConfigError, DQNConfig
 from mijax.losses import td
+from mijax.losses.returns import traced_returns
 from mijax.nets.belief import BeliefQ
 from mijax.nets.privileged import PrivilegedQ
 from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, Outputs, TwoBranchQ
@@ -139,16 +140,14 @@ class DQN(Agent):
         dqn = self.config.dqn
         valid, action = transitions(tokens), tokens.previous_action[:, 1:]
         greedy = jnp.argmax(q_select, axis=-1)[:, :-1] == action
-        follows = valid & greedy
-        trace = dqn.trace_decay * jnp.pad(follows[:, 1:].astype(jnp.float32), ((0, 0), (0, 1)))
         q_target = averaged.q if averaged.critic is None else averaged.critic
         if dqn.value_bound > 0:
             q_target = jnp.clip(q_target, -dqn.value_bound, dqn.value_bound)
-        target = td.watkins_returns(
+        target = traced_returns(
             r_t=tokens.reward[:, 1:] + bonus[:, 1:],
             discount_t=self._discounts(tokens),
             v_t=td.double_q_value(q_select[:, 1:], q_target[:, 1:]),
-            trace_t=trace,
+            trace_t=dqn.trace_decay * may_follow(valid & greedy),
         )
         loss, parts = td.td_loss(online.q[:, :-1], action, target, valid)
         metrics = {"loss/td": loss, "q/mean": parts["q"], "q/error": parts["td_error"],

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import optax
 
 from envs_mjx.base import ArraySpec, ContinuousActions, Environment
-from mijax.agents.core import Agent, Heads, adam, episode_mean, transitions
+from mijax.agents.core import Agent, Heads, adam, episode_mean, may_follow, transitions
 from mijax.agents.variants import Variant, memory_of, variant
 from mijax.config import Config, SACConfig
 from mijax.losses import sac
+from mijax.losses.returns import traced_returns
 from mijax.nets.actor_critic import (
     ActorCritic,
     BeliefActorCritic,
@@ -238,11 +239,11 @@ class SAC(Agent):
         valid, shape = transitions(tokens), tokens.segment.shape
         taken = jnp.roll(tokens.previous_action, -1, axis=1).reshape(-1, self.network.action_size)
         q = self._call("values", agent, online.critic, taken).reshape(-1, *shape)[..., :-1]
-        target = sac.soft_returns(
+        target = traced_returns(
             r_t=tokens.reward[:, 1:] + bonus[:, 1:],
             discount_t=self._discounts(tokens),
             v_t=soft_value[:, 1:],
-            trace_t=self.options.trace_decay * jnp.pad(valid[:, 1:].astype(jnp.float32), ((0, 0), (0, 1))),
+            trace_t=self.options.trace_decay * may_follow(valid),
         )
         loss, parts = sac.critic_loss(q, target, valid)
         return loss, {"loss/td": loss, "q/mean": parts["q"], "q/error": parts["td_error"],

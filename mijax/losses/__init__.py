@@ -12,18 +12,23 @@ from mijax.losses.information import (
     prediction_mse,
 )
 from mijax.losses.masks import masked_mean
-from mijax.losses.td import double_q_value, td_loss, watkins_returns
+from mijax.losses.returns import traced_returns
+from mijax.losses.sac import actor_loss, critic_loss, imitation_loss, sample_tanh_gaussian, temperature_loss
+from mijax.losses.td import double_q_value, td_loss
 
 __all__ = [
+    "actor_loss",
     "club_all_pairs",
     "club_sampled",
     "cosine",
     "cosine_bonus",
+    "critic_loss",
     "dim_jensen_shannon",
     "double_q_value",
     "explained_variance_bonus",
     "gaussian_fit",
     "gaussian_log_density",
+    "imitation_loss",
     "kl_standard_normal",
     "masked_mean",
     "negative_elbo",
@@ -31,6 +36,8 @@ __all__ = [
     "prediction_cosine",
     "prediction_mse",
     "reward_loss",
+    "sample_tanh_gaussian",
     "td_loss",
-    "watkins_returns",
+    "temperature_loss",
+    "traced_returns",
 ]

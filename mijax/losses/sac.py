@@ -33,32 +33,6 @@ def log_slope_of_tanh(x: jax.Array) -> jax.Array:
     return 2 * (_LOG_2 - x - jax.nn.softplus(-2 * x))
 
 
-def soft_returns(
-    r_t: jax.Array, discount_t: jax.Array, v_t: jax.Array, trace_t: jax.Array
-) -> jax.Array:
-    """Returns with uncorrected traces (Peng's Q(lambda)), G_{t-1} = r_t + discount_t ((1 - trace_t) v_t + trace_t G_t).
-
-    With `trace_t` = 0 everywhere this is SAC's one-step target r + gamma (1 - d) v, v = min_i Q_i - alpha log pi.
-
-    Args:
-        r_t: (..., T) reward of each transition.
-        discount_t: (..., T) gamma, or 0 where the episode ended.
-        v_t: (..., T) soft value of what was arrived at.
-        trace_t: (..., T) lambda where the next transition belongs to the same episode, else 0; the last must be 0.
-
-    Returns:
-        (..., T) targets.
-    """
-    chex.assert_equal_shape([r_t, discount_t, v_t, trace_t])
-    offset, slope = r_t + discount_t * (1 - trace_t) * v_t, discount_t * trace_t
-
-    def compose(later: tuple[jax.Array, jax.Array], earlier: tuple[jax.Array, jax.Array]):
-        return earlier[0] + earlier[1] * later[0], earlier[1] * later[1]
-
-    targets, _ = jax.lax.associative_scan(compose, (offset, slope), reverse=True, axis=r_t.ndim - 1)
-    return targets
-
-
 def critic_loss(q: jax.Array, target: jax.Array, mask: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The sum over the critics of E[ (target - Q_i)^2 ] over valid transitions; no gradient flows into the targets.
 

@@ -76,6 +76,10 @@ class DiscreteActions:
     num: int
     names: tuple[str, ...] = ()
 
+    def sample(self, key: jax.Array) -> jax.Array:
+        """() int32 drawn uniformly."""
+        return jax.random.randint(key, (), 0, self.num, jnp.int32)
+
 
 @dataclasses.dataclass(frozen=True)
 class ContinuousActions:
@@ -83,6 +87,10 @@ class ContinuousActions:
 
     size: int
     names: tuple[str, ...] = ()
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """(size,) float32 drawn uniformly."""
+        return jax.random.uniform(key, (self.size,), jnp.float32, -1.0, 1.0)
 
 
 ActionSpec = DiscreteActions | ContinuousActions

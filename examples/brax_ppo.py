@@ -26,12 +26,14 @@ from brax.training.agents.ppo import train as ppo
 from envs_mjx import registry
 from envs_mjx.adapters.brax import POLICY_KEY, VALUE_KEY, AsBrax, on_recent_jax, wrap
 from envs_mjx.base import DiscreteActions
+from envs_mjx.contract import ContractError, check_contract
 from envs_mjx.grid.optimal import optimum
 from mijax import report, runtime
 from mijax.config import Config, ConfigError, EvaluationConfig, parse_seeds, require
-from mijax.metrics import ProgressDisplay, RunError, RunFolder
+from mijax.progress import ProgressDisplay
 from mijax.results import load, summarise
 from mijax.rollout import evaluate
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
 from mijax.train import FINAL_EPISODES, CompileClock
 
@@ -122,7 +124,7 @@ def train(options: PPOOptions, say: Callable[[str], None] = print) -> RunFolder:
     seeds = parse_seeds(options.seeds)
     env = AsBrax(options.domain, history=options.history,
                  critic="history_state" if options.critic == "history" else options.critic)
-    registry.check_contract(env.env)
+    check_contract(env.env)
     out = options.out or pathlib.Path("runs") / f"{options.domain.replace(':', '.')}-ppo"
     stored = {name: value for name, value in dataclasses.asdict(options).items() if name not in ("out", "seeds")}
     run = RunFolder.create(out, stored | {
@@ -201,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = tyro.cli(PPOOptions, args=arguments, prog="python -m examples.brax_ppo")
         runtime.prepare()
         train(options)
-    except (ConfigError, RunError, registry.UnknownDomain, registry.ContractError) as error:
+    except (ConfigError, RunError, registry.UnknownDomain, ContractError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0

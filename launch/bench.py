@@ -36,7 +36,7 @@ from mijax.learner import Learner, LearnerState, make_learner
 from mijax.nets.encoders import encoder_for
 from mijax.packing import fit_folds, gather_rows, one_per_row, row_choices
 from mijax.replay import Replay, StepRecord, sample_episodes
-from mijax.representation.dataset import collect, random_action
+from mijax.representation.dataset import collect
 from mijax.representation.problem import Problem
 from mijax.representation.train import LossWeights, initial_state, make_epoch
 from mijax.rollout import select
@@ -150,7 +150,7 @@ def bench_environments(bench: Bench, env: Environment) -> Iterator[Result]:
 
             def step(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
                 key_action, key_step, key_reset = jax.random.split(key, 3)
-                action = jax.vmap(lambda k: random_action(env.action_spec, k))(jax.random.split(key_action, batch))
+                action = jax.vmap(env.action_spec.sample)(jax.random.split(key_action, batch))
                 env_state, timestep = jax.vmap(env.step)(jax.random.split(key_step, batch), carry[0], action)
                 fresh = jax.vmap(env.reset)(jax.random.split(key_reset, batch))
                 shown = jnp.stack([jnp.max(x).astype(jnp.float32) for x in jax.tree.leaves(timestep)])

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import sys
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +12,12 @@ import tyro
 import configs
 from envs_mjx import registry
 from envs_mjx.robot import headless, scene
+from envs_mjx.robot.drawer_opening import MAX_TRAVEL, DrawerOpening
 from envs_mjx.robot.gap import GAPS
-from envs_mjx.robot.realworld import RealWorld
+from envs_mjx.robot.realworld import NoOpenGL, RealWorld
 from envs_mjx.robot.task import RobotState, RobotTask
 from mijax import runtime
-
-_TRAVEL = 0.1
-"""Metres that a drawer may be open."""
+from mijax.config import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,8 +26,8 @@ class FusionOptions:
 
     scenes: int = 200
     """Per task."""
-    gap: Literal["none", "mild", "hard"] = "none"
-    """What the cameras are like: none is exact (envs_mjx/robot/gap.py)."""
+    gap: str = "none"
+    """What the cameras are like: none (exact), mild or hard (envs_mjx/robot/gap.py)."""
 
 
 def moments(training: RobotTask, key: jax.Array, number: int) -> list[RobotState]:
@@ -40,8 +38,8 @@ def moments(training: RobotTask, key: jax.Array, number: int) -> list[RobotState
         place = jax.random.uniform(key_place, (5,), jnp.float32)
         low, high = jnp.asarray(scene.WORKSPACE_LOW), jnp.asarray(scene.WORKSPACE_HIGH)
         qpos = env_state.qpos.at[:3].set(low + place[:3] * (high - low)).at[3].set((2 * place[3] - 1) * jnp.pi)
-        if training.name == "drawer_opening":
-            qpos = qpos.at[4].set(place[4] * _TRAVEL)
+        if isinstance(training, DrawerOpening):
+            qpos = qpos.at[4].set(place[4] * MAX_TRAVEL)
         return dataclasses.replace(env_state, qpos=qpos)
 
     drawn = jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(key, number)))
@@ -58,13 +56,11 @@ def errors(world: RealWorld, robots: list[RobotState], gripper: bool) -> np.ndar
     return np.stack(found)
 
 
-def main() -> int:
+def compare(options: FusionOptions) -> None:
     """Print the table."""
-    options = tyro.cli(FusionOptions, prog="python -m launch.fusion")
-    runtime.prepare()
+    require(options.gap in GAPS, "gap", options.gap, ", ".join(GAPS))
     if headless.bind() is None:
-        print("error: no OpenGL without a display: the cameras need EGL or OSMesa", file=sys.stderr)
-        return 1
+        raise NoOpenGL("no OpenGL without a display: the cameras need EGL or OSMesa")
     print(f"{options.scenes} scenes of each task, gap {options.gap}")
     print(f"{'task':<16}{'gripper':<14}{'median mm':>10}{'<= 5 mm':>9}{'worst scene':>12}")
     for domain in configs.ROBOTS:
@@ -77,7 +73,13 @@ def main() -> int:
                 near = (error <= 0.005).mean(axis=(1, 2))
                 print(f"{domain:<16}{'in sight' if gripper else 'out of sight':<14}{np.median(error) * 1e3:>10.4f}"
                       f"{near.mean():>9.4f}{near.min():>12.4f}", flush=True)
-    return 0
+
+
+def main() -> int:
+    """The command; returns its exit code."""
+    options = tyro.cli(FusionOptions, prog="python -m launch.fusion")
+    runtime.prepare()
+    return runtime.exit_code(lambda: compare(options), NoOpenGL)
 
 
 if __name__ == "__main__":

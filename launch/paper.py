@@ -26,15 +26,16 @@ from configs.paper import STEPS
 from envs_mjx import registry
 from envs_mjx.base import ContinuousActions
 from launch.experiments import DOMAINS, EXPERIMENTS, Arm
-from mijax import episode, evaluate, figures, runtime, stage1, tables, train
+from mijax import episode, figures, runtime, stage1, tables, train
 from mijax.agents.variants import needs_representation, stage1_of, unread_groups
-from mijax.config import Config, ConfigError, Stage1Config, config_from_dict, parse_seeds, require
+from mijax.config import Config, ConfigError, options_of, parse_seeds, require
 from mijax.learner import make_learner
-from mijax.metrics import RunError, RunFolder
 from mijax.representation.dataset import collect
 from mijax.representation.storage import FACTS_FILE
 from mijax.results import ReportedRun, summarise
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
+from mijax.trained import load_learner_state, stage1_in, training_of
 
 PAPER_SEEDS = 5
 TRACED_EPISODES = 100
@@ -77,12 +78,12 @@ def run_arm(request: Request, domain: str, arm: Arm) -> list[RunFolder]:
     options = request.parse(domain, arm)
     place = folder_of(request, domain, arm, options)
     runs = [RunFolder.open(path) for path in sorted(place.glob("seeds_*")) if (path / "config.json").exists()]
-    runs = [run for run in runs if set(run.config()["seed_list"]) & set(request.seeds)]
+    runs = [run for run in runs if set(training_of(run).seeds) & set(request.seeds)]
     for run in runs:
         check_same(run, options)
         if run.summary() is None:
             finish(train.parse(("--resume", str(run.path))))
-    missing = [seed for seed in request.seeds if not any(seed in run.config()["seed_list"] for run in runs)]
+    missing = [seed for seed in request.seeds if not any(seed in training_of(run).seeds for run in runs)]
     if missing:
         features = features_of(arm, options.config)
         source = None if features is None else shared_features(request, domain, features, options)
@@ -107,8 +108,7 @@ def finish(options: train.TrainOptions) -> RunFolder:
 
 def check_same(run: RunFolder, options: train.TrainOptions) -> None:
     """Raise `RunError` if a run was made with other options than it would be now, as far as its agent reads them."""
-    stored = {name: value for name, value in run.config().items() if name not in ("seed_list", "track")}
-    there, wanted = (_flat(dataclasses.asdict(config)) for config in (config_from_dict(stored), options.config))
+    there, wanted = map(options_of, (training_of(run).config, options.config))
     free = ("memory", "seeds.strategy")  # resolved from `auto` when stored; not meant to change what is learnt
     actions = registry.make(options.config.domain).action_spec
     unread = unread_groups(options.config, continuous=isinstance(actions, ContinuousActions))
@@ -117,13 +117,6 @@ def check_same(run: RunFolder, options: train.TrainOptions) -> None:
     if other:
         raise RunError(f"{run.path}: was made with --{other[0].replace('_', '-')} {there[other[0]]}, wanted "
                        f"{wanted[other[0]]}; choose another --out")
-
-
-def _flat(values: dict, prefix: str = "") -> dict:
-    flat = {}
-    for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
 
 
 def features_of(arm: Arm, config: Config) -> str | None:
@@ -137,7 +130,7 @@ def shared_features(request: Request, domain: str, features: str, options: train
     config, path = options.config, request.out / "runs" / registry.file_name(domain) / f"features-{features}"
     if (path / "config.json").exists():
         run = RunFolder.open(path)
-        if Stage1Config(**run.config()["stage1"]) != config.stage1:
+        if stage1_in(run.config()) != config.stage1:
             raise RunError(f"{path}: was made with other --stage1 options; choose another --out")
     else:
         run = RunFolder.create(path, {"domain": domain, "stage1": dataclasses.asdict(config.stage1)})
@@ -200,17 +193,28 @@ def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
         if missing:
             note += f". Left out: {', '.join(missing)}"
         if any(start for group in starts.values() for start in group.values()):
-            note += ". Dashed vertical: stage 1's random steps end, task learning starts"
+            note += ". Dashed vertical: stage 1's random steps end, task learning starts" + began(starts)
         figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note, starts=starts)
-        write_table(name, request, experiment.title, groups, note)
+        write_table(name, request, experiment.title, groups, starts, note)
 
 
-def write_table(name: str, request: Request, title: str, groups: dict[str, list[ReportedRun]], note: str) -> None:
+def began(starts: dict[str, dict[str, int]]) -> str:
+    """How many of stage 1's steps there are, where it is one number."""
+    numbers = {start for group in starts.values() for start in group.values() if start}
+    return f" ({numbers.pop():,} steps)" if len(numbers) == 1 else ""
+
+
+def write_table(
+    name: str, request: Request, title: str, groups: dict[str, list[ReportedRun]], starts: dict[str, dict[str, int]],
+    note: str
+) -> None:
     """OUT/NAME.md and OUT/NAME.csv."""
-    lines = [{"panel": panel, **line} for panel, runs in groups.items() for line in tables.comparison_table(runs)]
+    lines = [{"panel": panel, **line} for panel, runs in groups.items()
+             for line in tables.comparison_table(runs, starts[panel])]
     tables.write_csv(request.out / f"{name}.csv", lines)
     text = (f"# {title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
-            + "\n\n".join(f"## {panel}\n\n{tables.comparison_markdown(runs)}" for panel, runs in groups.items()) + "\n")
+            + "\n\n".join(f"## {panel}\n\n{tables.comparison_markdown(runs, starts[panel])}"
+                          for panel, runs in groups.items()) + "\n")
     (request.out / f"{name}.md").write_text(text, encoding="utf-8")
     SAY(text)
 
@@ -231,10 +235,10 @@ def run_intrinsic(name: str, request: Request, domains: Sequence[str]) -> None:
         (arm,), = EXPERIMENTS[name].groups(domain).values()
         runs = run_arm(request, domain, arm)
         for run in runs:
-            config = evaluate.config_of(run)
+            config = training_of(run).config
             learner, steps[domain] = make_learner(registry.make(domain), config), config.steps
             for seed in (seed for seed in run.seeds() if seed in request.seeds):
-                step, state = evaluate.load_learner_state(run, seed, learner)
+                step, state = load_learner_state(run, seed, learner)
                 seen = episode.trace(learner, state, evaluation_key(seed, step), TRACED_EPISODES)
                 ends = seen.reward[np.arange(TRACED_EPISODES), seen.length]
                 lines.append({
@@ -323,7 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             SAY(f"== {name}: {EXPERIMENTS[name].title}: {', '.join(domains)}")
             (run_intrinsic if name == "fig32" else run_curves)(name, request, domains)
 
-    return runtime.exit_code(work, train.USER_ERRORS)
+    return runtime.exit_code(work)
 
 
 if __name__ == "__main__":

@@ -61,7 +61,7 @@ def measure(env: RobotTask, steps: int, repetitions: int) -> Measurement:
 
         def step(carry: tuple[RobotState, TimeStep], key: jax.Array) -> tuple[tuple, jax.Array]:
             key_action, key_step, key_reset = jax.random.split(key, 3)
-            action = jax.vmap(lambda k: registry.sample_action(env, k))(jax.random.split(key_action, BATCH))
+            action = jax.vmap(env.action_spec.sample)(jax.random.split(key_action, BATCH))
             following = jax.vmap(env.step)(jax.random.split(key_step, BATCH), carry[0], action)
             fresh = jax.vmap(env.reset)(jax.random.split(key_reset, BATCH))
             shown = jnp.stack([jnp.sum(x.astype(jnp.float32)) for x in jax.tree.leaves(following[1])])

@@ -43,7 +43,7 @@ from rich.table import Table
 from launch.job import available_cores
 from mijax import train
 from mijax.config import ConfigError, parse_seeds, require
-from mijax.metrics import RunError, RunFolder
+from mijax.run_folder import RunError, RunFolder
 
 State = Literal["waiting", "submitted", "running", "done", "failed", "stopped"]
 KEYS = ("options", "grid", "seeds", "seeds_per_job", "resources", "retries")

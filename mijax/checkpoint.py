@@ -3,7 +3,8 @@
     RUN/seed_K/checkpoints/STEP/     the newest few, one folder per environment step
 
 A state is stored as a flat dictionary of arrays under the names of its fields, so that a checkpoint can be read, and
-its mismatch with another configuration be named, without the classes that wrote it.
+its mismatch with another configuration be named, without the classes that wrote it. Arrays without entries, as a
+simulator's state may have, are left out: Orbax does not store them.
 """
 
 import logging
@@ -17,7 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from mijax.learner import LearnerState
-from mijax.metrics import RunError, RunFolder
+from mijax.run_folder import RunError, RunFolder
 
 FOLDER = "checkpoints"
 
@@ -70,6 +71,12 @@ class Checkpoints:
             raise RunError(f"{where}: corrupt or half-written checkpoint: {_one_line(error)}") from error
         return _unflatten(dict(values), template)
 
+    def drop_after(self, step: int) -> None:
+        """Delete what is newer than `step`: it was of no use, and will be written again."""
+        for newer in self.steps():
+            if newer > step:
+                self._manager.delete(newer)
+
     def close(self) -> None:
         """Release the folder."""
         self._manager.close()
@@ -104,7 +111,7 @@ def exists(run: RunFolder, seeds: Sequence[int]) -> bool:
 
 def _flatten(state: Any) -> dict[str, Any]:
     leaves = jax.tree_util.tree_flatten_with_path(state)[0]
-    return {jax.tree_util.keystr(path, simple=True, separator="."): _plain(x) for path, x in leaves}
+    return {jax.tree_util.keystr(path, simple=True, separator="."): _plain(x) for path, x in leaves if x.size}
 
 
 def _plain(leaf: Any) -> Any:
@@ -120,6 +127,9 @@ def _unflatten(values: dict[str, Any], template: LearnerState) -> LearnerState:
     paths, structure = jax.tree_util.tree_flatten_with_path(template)
     leaves = []
     for path, wanted in paths:
+        if not wanted.size:
+            leaves.append(jnp.zeros(wanted.shape, wanted.dtype))
+            continue
         value = values[jax.tree_util.keystr(path, simple=True, separator=".")]
         is_key = jnp.issubdtype(wanted.dtype, jax.dtypes.prng_key)
         leaves.append(jax.random.wrap_key_data(value) if is_key else value)

@@ -5,6 +5,8 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from envs_mjx.errors import UserError
+
 MemoryKind = Literal["gpt", "gru", "mlp"]
 MemoryName = Literal["auto", "gpt", "gru", "mlp"]
 CriticInput = Literal["state", "history_state"]
@@ -17,7 +19,7 @@ TrunkKind = Literal["own", "shared", "psi"]
 SeedStrategy = Literal["auto", "map", "vmap", "shard"]
 
 
-class ConfigError(Exception):
+class ConfigError(UserError):
     """An option has a value that cannot be run; the message names the option and what is accepted.
 
     No ValueError: the command line parser would wrap those in a box of its own.
@@ -373,7 +375,8 @@ class Config:
     memory: MemoryName = "auto"
     """The sequence model of the memory branch. auto: the agent's own, for most a gpt; mlp: no memory."""
     steps: int = 100_000
-    """Environment steps of stage 2."""
+    """Environment steps of stage 2, its random ones at the start included; the last evaluation comes after them, when
+    another `evaluation.every` steps are whole."""
     num_envs: int = 4
     """Environments stepped side by side."""
     steps_per_iteration: int = 5
@@ -409,6 +412,14 @@ class Config:
         require(whole, f"{group}.updates-per-step", updates_per_step,
                 f"a whole number of updates in num-envs x steps-per-iteration = {steps} steps")
         return round(updates)
+
+
+def options_of(config: Config) -> dict[str, Any]:
+    """Every option by its name on the command line, with underscores: {"dqn.learning_rate": 0.0003, ...}."""
+    flat = {}
+    for name, value in dataclasses.asdict(config).items():
+        flat |= {f"{name}.{inner}": x for inner, x in value.items()} if isinstance(value, dict) else {name: value}
+    return flat
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:

@@ -19,19 +19,16 @@ from envs_mjx import registry
 from envs_mjx.base import Environment, EnvState
 from envs_mjx.grid import draw
 from envs_mjx.grid.optimal import optimum
-from mijax import checkpoint, evaluate_robot, runtime, stage1
+from mijax import evaluate_robot, runtime
 from mijax.agents.forgetful import Forgetful
-from mijax.agents.variants import VARIANTS, memory_of, needs_representation
-from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
+from mijax.agents.variants import memory_of
+from mijax.config import require
 from mijax.learner import Learner, LearnerState, make_learner
-from mijax.metrics import RunError, RunFolder
-from mijax.representation.storage import RepresentationError, load_representation
 from mijax.rollout import Actor
-from mijax.seeds import evaluation_key, training_key
+from mijax.run_folder import RunFolder
+from mijax.seeds import evaluation_key
+from mijax.trained import load_learner_state, seeds_of, training_of
 
-USER_ERRORS = (ConfigError, RunError, RepresentationError, registry.UnknownDomain, registry.ContractError,
-               draw.NoDrawing, OSError)
-"""What a user can mend: shown as one line."""
 EPISODE_FILE = "episode.gif"
 COLUMNS = ("success", "return", "discounted_return", "of_optimum", "length", "reveals", *evaluate_robot.HALVES)
 
@@ -68,30 +65,6 @@ class EvaluateOptions:
     """Folder for the pictures of --planner; default runs/DOMAIN-planner."""
     text: bool = False
     """Print an episode of each seed, step by step."""
-
-
-def config_of(run: RunFolder) -> Config:
-    """The options that a run is trained under."""
-    stored = run.config()
-    if "agent" not in stored:
-        raise RunError(f"{run.path}: holds representations but no agent to evaluate")
-    if stored["agent"] not in VARIANTS:
-        raise RunError(f"{run.path}: its agent {stored['agent']!r} is another program's, accepted: mijax.train's runs")
-    return config_from_dict({name: value for name, value in stored.items() if name not in ("seed_list", "track")})
-
-
-def load_learner_state(run: RunFolder, seed: int, learner: Learner) -> tuple[int, LearnerState]:
-    """The environment step of a seed's newest whole checkpoint, and the state there."""
-    if not checkpoint.exists(run, [seed]):
-        raise RunError(f"{run.path}: seed {seed} has no checkpoint yet")
-    representation = None
-    if needs_representation(learner.config):
-        representation = load_representation(stage1.folder_of(run, seed), learner.domain)
-    template = jax.eval_shape(learner.init, training_key(seed), representation)
-    checkpoints = checkpoint.Checkpoints(run, seed)
-    step, states = checkpoint.load_latest({seed: checkpoints}, template, functools.partial(print, file=sys.stderr))
-    checkpoints.close()
-    return step, states[seed]
 
 
 def play(learner: Learner, state: LearnerState, key: jax.Array, actor: Actor | None = None) -> list[EnvState]:
@@ -189,12 +162,7 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
         return None
     assert options.run is not None
     run = RunFolder.open(options.run)
-    config, present = config_of(run), run.seeds()
-    seeds = present if options.seeds is None else parse_seeds(options.seeds)
-    missing = [seed for seed in seeds if seed not in present]
-    if missing or not seeds:
-        named = f"no seed {missing[0]}" if missing else "no seed"
-        raise RunError(f"{run.path}: has {named} (it has {', '.join(map(str, present)) or 'none'})")
+    config, seeds = training_of(run).config, seeds_of(run, options.seeds)
     learner = make_learner(registry.make(config.domain), config)
     actor = Forgetful(learner.agent, options.remember) if options.remember else learner.agent
     rows, steps = {}, {}
@@ -211,11 +179,10 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    options = tyro.cli(EvaluateOptions, args=list(arguments), prog="python -m mijax.evaluate")
+    """The command; returns its exit code."""
+    options = tyro.cli(EvaluateOptions, args=arguments, prog="python -m mijax.evaluate")
     runtime.prepare()
-    return runtime.exit_code(lambda: evaluate(options), USER_ERRORS)
+    return runtime.exit_code(lambda: evaluate(options))
 
 
 if __name__ == "__main__":

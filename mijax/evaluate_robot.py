@@ -2,23 +2,25 @@
 
 import functools
 import pathlib
+import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 import jax
 import numpy as np
 
 import configs
 from envs_mjx import registry
-from envs_mjx.base import Environment, EnvState
+from envs_mjx.base import Environment
 from envs_mjx.grid import draw
-from mijax.config import require
-from mijax.metrics import RunError
+from mijax.config import ConfigError
 from mijax.rollout import Actor
+from mijax.run_folder import RunError
 from mijax.types import Params
 
 if TYPE_CHECKING:
+    from envs_mjx.robot.task import RobotState, RobotTask
     from envs_mjx.robot.trial import Trial
 
 EPISODE_FILE, PAGE_FILE = "planner.gif", "planner.html"
@@ -27,16 +29,17 @@ HALVES = ("movable_first", "immovable_first")
 DEMONSTRATED = ", ".join(configs.ROBOTS)
 
 
-def is_robot(env: Environment) -> bool:
-    """Whether an environment is a robot task; MuJoCo is imported with the task only."""
-    return hasattr(env, "physics")
+def is_robot(env: Environment) -> "TypeGuard[RobotTask]":
+    """Whether an environment is a robot task. Where none has been made, MuJoCo is not imported for the answer."""
+    task = sys.modules.get("envs_mjx.robot.task")
+    return task is not None and isinstance(env, task.RobotTask)
 
 
-def robot(option: str, domain: str) -> Environment:
-    """The robot task of that name; `ConfigError` for a domain without a planner, before any work."""
+def robot(option: str, domain: str) -> "RobotTask":
+    """The robot task of that name; `ConfigError` for any other domain, before any work."""
     env = registry.make(domain)
-    has_expert = type(env).demonstrations is not Environment.demonstrations
-    require(has_expert and is_robot(env), "domain", domain, f"with --{option} a robot task: {DEMONSTRATED}")
+    if not is_robot(env):
+        raise ConfigError(f"--domain: got {domain!r}, accepted: with --{option} a robot task: {DEMONSTRATED}")
     return env
 
 
@@ -61,7 +64,7 @@ def evaluate_planner(
     except page.ViewerMissing as error:
         raise RunError(str(error)) from None
     started = time.perf_counter()
-    played = trial.expert_trial(env, jax.random.key(0), episodes)  # pyright: ignore[reportArgumentType]
+    played = trial.expert_trial(env, jax.random.key(0), episodes)
     say(f"{domain}: {episodes} episodes of the scripted expert in {time.perf_counter() - started:.0f} s")
     assert played.movable_first is not None
     say(f"{'works first on':<22}{'episodes':>9}{'success':>9}{'mean length':>13}{'median':>8}")
@@ -76,7 +79,7 @@ def evaluate_planner(
     if gif or scripts is not None:
         out.mkdir(parents=True, exist_ok=True)
     if scripts is not None:
-        (out / PAGE_FILE).write_text(page.page(env, moments, scripts))  # pyright: ignore[reportArgumentType]
+        (out / PAGE_FILE).write_text(page.page(env, moments, scripts))
         say(f"an episode that begins with the immovable object: {out / PAGE_FILE}")
     if gif:
         save_gif(env, moments, out / EPISODE_FILE, say)
@@ -90,7 +93,7 @@ def evaluate_random(domain: str, episodes: int, say: Callable[[str], None]) -> "
     from envs_mjx.robot import trial
 
     started = time.perf_counter()
-    played = trial.random_trial(env, jax.random.key(0), episodes)  # pyright: ignore[reportArgumentType]
+    played = trial.random_trial(env, jax.random.key(0), episodes)
     say(f"{domain}: {episodes} episodes of random actions in {time.perf_counter() - started:.0f} s, "
         f"mean length {played.length.mean():.1f}")
     say(_endings(played))
@@ -98,14 +101,13 @@ def evaluate_random(domain: str, episodes: int, say: Callable[[str], None]) -> "
     return played
 
 
-def halves(env: Environment, actor: Actor, params: Params, key: jax.Array, episodes: int) -> dict[str, float]:
+def halves(env: "RobotTask", actor: Actor, params: Params, key: jax.Array, episodes: int) -> dict[str, float]:
     """Success of greedy episodes by which object was touched first, the movable or the immovable one; left out where
     that never happened."""
     from envs_mjx.robot import trial
 
     played = trial.policy_trial(
-        env, functools.partial(actor.act, params), actor.initial_memory, actor.no_action,  # pyright: ignore[reportArgumentType]
-        key, episodes)
+        env, functools.partial(actor.act, params), actor.initial_memory, actor.no_action, key, episodes)
     assert played.movable_first is not None
     rows = zip(HALVES, (played.touched & played.movable_first, played.touched & ~played.movable_first), strict=True)
     return {name: float(played.success[which].mean()) for name, which in rows if which.any()}
@@ -115,11 +117,13 @@ def _endings(played: "Trial") -> str:
     return "endings: " + ", ".join(f"{name} {count}" for name, count in played.counts().items())
 
 
-def save_gif(env: Environment, moments: Sequence[EnvState], path: pathlib.Path, say: Callable[[str], None]) -> None:
+def save_gif(
+    env: "RobotTask", moments: "Sequence[RobotState]", path: pathlib.Path, say: Callable[[str], None]
+) -> None:
     """An episode of a robot task as a film: depth, what the state adds, and a rendered view where there is OpenGL."""
     from envs_mjx.robot import film
 
-    pictures = film.rendered(env, moments)  # pyright: ignore[reportArgumentType]
+    pictures = film.rendered(env, moments)
     if pictures is None:
         say("no OpenGL without a display (EGL or OSMesa): the pictures show depth and state, and no rendered view")
-    draw.save_gif(path, film.frames(env, moments, pictures))  # pyright: ignore[reportArgumentType]
+    draw.save_gif(path, film.frames(env, moments, pictures))

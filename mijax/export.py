@@ -20,7 +20,7 @@ import tyro
 from jax import export as jax_export
 
 from envs_mjx import registry
-from mijax import evaluate, runtime, serve
+from mijax import runtime, serve
 from mijax.agents.core import Agent
 from mijax.agents.variants import memory_of
 from mijax.config import require
@@ -29,11 +29,12 @@ from mijax.deploy.numpy_policy import CONTRACT_FILE, FILES, Policy, PolicyError
 from mijax.deploy.parity import Parity, compare, play
 from mijax.deploy.step import PolicyStep, contract, policy_step
 from mijax.learner import make_learner
-from mijax.metrics import RunError, RunFolder, current_versions
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
+from mijax.trained import load_learner_state, seed_of, training_of
 from mijax.types import Params
+from mijax.versions import current_versions
 
-USER_ERRORS = (*evaluate.USER_ERRORS, PolicyError)
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 """What a StableHLO export runs on."""
 
@@ -133,15 +134,11 @@ def export(options: ExportOptions) -> pathlib.Path:
     require(options.episodes >= 1, "episodes", options.episodes, "a number >= 1")
     runtimes.require(options.to, *runtimes.WRITES[options.to])
     run = RunFolder.open(options.run)
-    config, present = evaluate.config_of(run), run.seeds()
-    seed = options.seed if options.seed is not None else min(present, default=-1)
-    if seed not in present:
-        named = "no seed" if options.seed is None else f"no seed {seed}"
-        raise RunError(f"{run.path}: has {named} (it has {', '.join(map(str, present)) or 'none'})")
+    config, seed = training_of(run).config, seed_of(run, options.seed)
     out = options.out or run.seed_path(seed) / f"policy_{options.to}"
     check_free(out)
     learner = make_learner(registry.make(config.domain), config)
-    at_step, state = evaluate.load_learner_state(run, seed, learner)
+    at_step, state = load_learner_state(run, seed, learner)
     origin = {"run": {"name": run.path.resolve().name, "seed": seed, "step": at_step, "versions": run.versions(),
                       "config": run.config()}, "exported_with": current_versions()}
     policy, found = write(options.to, learner.agent, state.agent.target, out, origin, evaluation_key(seed, at_step),
@@ -154,11 +151,10 @@ def export(options: ExportOptions) -> pathlib.Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    options = tyro.cli(ExportOptions, args=list(arguments), prog="python -m mijax.export")
+    """The command; returns its exit code."""
+    options = tyro.cli(ExportOptions, args=arguments, prog="python -m mijax.export")
     runtime.prepare()
-    return runtime.exit_code(lambda: export(options), USER_ERRORS)
+    return runtime.exit_code(lambda: export(options), PolicyError)
 
 
 if __name__ == "__main__":

@@ -295,9 +295,8 @@ class Learner:
 def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:
     """The learner that a configuration describes."""
     domain, env = env, StateShown(env) if variant(config.agent).sees_state else env
-    listed = env.all_observations()
-    table = None if listed is None else FrameTable(listed)
-    agent = make_agent(env, config)
+    agent, listed = make_agent(env, config), env.all_observations()
+    table = None if listed is None or agent.looks_once else FrameTable(listed)
     moments = table is None and not agent.looks_once and shows_again(env)
     return Learner(domain, env, config, agent, table, moments, pack)
 

@@ -27,18 +27,18 @@ import tyro
 
 from envs_mjx import registry
 from envs_mjx.base import DiscreteActions
+from envs_mjx.errors import UserError
 from envs_mjx.grid.world import GridWorld
-from mijax import episode, evaluate, page, runtime
+from mijax import episode, page, runtime
 from mijax.figures import display_name, draw_curves
 from mijax.learner import Learner, make_learner
-from mijax.metrics import RunError, RunFolder
 from mijax.page.episodes import Episodes, episode_data
 from mijax.results import ReportedRun, load
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
 from mijax.tables import markdown, run_table, seed_table, write_csv
+from mijax.trained import load_learner_state, seed_of, training_of
 
-USER_ERRORS = evaluate.USER_ERRORS
-"""What a user can mend: shown as one line."""
 EPISODES, EPISODES_OF_IMAGES = 4, 1
 """Episodes of a run on a page; a robot's have three images per step. Grid worlds are drawn by their cells."""
 
@@ -48,7 +48,7 @@ def write_report(runs: Sequence[ReportedRun], out: pathlib.Path, *, smooth: int 
     out.mkdir(parents=True, exist_ok=True)
     domains = list(dict.fromkeys(run.domain for run in runs))
     for domain in domains:
-        name = "curve.png" if len(domains) == 1 else f"curve_{domain.replace(':', '.')}.png"
+        name = "curve.png" if len(domains) == 1 else f"curve_{registry.file_name(domain)}.png"
         draw_curves([run for run in runs if run.domain == domain], out / name, smooth=smooth,
                     note=note)
     write_csv(out / "runs.csv", run_table(runs))
@@ -63,14 +63,14 @@ def report_page(runs: Sequence[ReportedRun], path: pathlib.Path, options: "Repor
     folders = [run.folder for run in runs if run.folder is not None]
     if options.seed is not None:
         for folder in folders:
-            _seed_of(folder, options.seed)
+            seed_of(folder, options.seed)
     shown: list[Episodes | str | None] = []
     for run, folder in zip(runs, folders, strict=True):
         print(f"{run.label}: playing its newest checkpoint", file=sys.stderr)
         try:
             learner, seed, step, seen = _trace(folder, options.seed, _how_many(run.domain))
             shown.append(episode_data(learner, seen, seed=seed, step=step))
-        except USER_ERRORS as error:
+        except (UserError, OSError) as error:
             shown.append(str(error).replace(str(folder.path), run.label))  # a page is sent, a path says nothing there
     page.write_page(runs, path, shown, smooth=options.smooth, note=options.note)
 
@@ -80,20 +80,11 @@ def _how_many(domain: str) -> int:
     return EPISODES_OF_IMAGES if env.observation_spec.is_image and not isinstance(env, GridWorld) else EPISODES
 
 
-def _seed_of(run: RunFolder, asked: int | None) -> int:
-    """The seed that was asked for, or the run's first."""
-    seeds = run.seeds()
-    seed = next(iter(seeds), 0) if asked is None else asked
-    if seed not in seeds:
-        raise RunError(f"--seed: got {seed}, accepted: {', '.join(map(str, seeds)) or 'none, the run has no seed yet'}")
-    return seed
-
-
 def _trace(run: RunFolder, asked: int | None, episodes: int) -> tuple[Learner, int, int, episode.Trace]:
     """Greedy episodes of a seed's newest checkpoint: the learner, the seed, the checkpoint's step, the trace."""
-    config, seed = evaluate.config_of(run), _seed_of(run, asked)
+    config, seed = training_of(run).config, seed_of(run, asked)
     learner = make_learner(registry.make(config.domain), config)
-    step, state = evaluate.load_learner_state(run, seed, learner)
+    step, state = load_learner_state(run, seed, learner)
     return learner, seed, step, episode.trace(learner, state, evaluation_key(seed, step), episodes)
 
 
@@ -102,7 +93,7 @@ def report_episode(options: "ReportOptions") -> pathlib.Path:
     if len(options.runs) != 1:
         raise RunError(f"--episode: got {len(options.runs)} runs, accepted: one")
     run = RunFolder.open(options.runs[0])
-    config = evaluate.config_of(run)
+    config = training_of(run).config
     if not isinstance(registry.make(config.domain).action_spec, DiscreteActions):
         raise RunError(f"--episode: {config.domain} has continuous actions, accepted: a run with discrete ones; for a "
                        f"page: --html, for a film: python -m mijax.evaluate {run.path} --gif")
@@ -159,7 +150,7 @@ def draw(options: ReportOptions) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = tyro.cli(ReportOptions, args=arguments, prog="python -m mijax.report")
-    return runtime.exit_code(lambda: draw(options), USER_ERRORS)
+    return runtime.exit_code(lambda: draw(options))
 
 
 if __name__ == "__main__":

@@ -14,15 +14,10 @@ import tyro
 
 import configs
 from envs_mjx import registry
+from envs_mjx.contract import check_contract
 from mijax import runtime, stage1
-from mijax.config import ConfigError, Stage1Config, parse_seeds, require
-from mijax.metrics import RunError, RunFolder
-from mijax.representation import DivergenceError
-from mijax.representation.storage import RepresentationError
-
-USER_ERRORS = (ConfigError, RunError, RepresentationError, DivergenceError, registry.UnknownDomain,
-               registry.ContractError, OSError)
-"""What a user can mend: shown as one line."""
+from mijax.config import Stage1Config, parse_seeds, require
+from mijax.run_folder import RunError, RunFolder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,20 +61,25 @@ def represent(options: RepresentOptions) -> None:
     """Train, probe and keep the representation of every seed that has none yet; fine if one fails its probe."""
     require(options.search >= 0, "search", options.search, "a number >= 1, or 0 for none")
     seeds, env = parse_seeds(options.seeds), registry.make(options.domain)
+    check_contract(env)
     run = open_run(options, seeds)
     if options.search:
         passed = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print).best.passed
     else:
         stage1.representations(run, env, options.stage1, seeds, print)
         passed = sum(stage1.passed(run, seed) for seed in seeds)
-    print(f"{passed} of {len(seeds)} representations pass P1 and P2")
+    if env.variables:
+        print(f"{passed} of {len(seeds)} representations pass P1 and P2")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command."""
-    options = parse(sys.argv[1:] if arguments is None else arguments)
-    runtime.prepare(host_devices=runtime.cores() if options.search else 1)
-    return runtime.exit_code(lambda: represent(options), USER_ERRORS)
+    """The command; returns its exit code."""
+    def work() -> None:
+        options = parse(sys.argv[1:] if arguments is None else arguments)
+        runtime.prepare(host_devices=runtime.cores() if options.search else 1)
+        represent(options)
+
+    return runtime.exit_code(work)
 
 
 if __name__ == "__main__":

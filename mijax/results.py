@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mijax import statistics
-from mijax.metrics import Row, RunError, RunFolder
+from mijax.run_folder import Row, RunError, RunFolder
 
 SOLVED = 0.95
 """Success from which an evaluation counts as solved."""

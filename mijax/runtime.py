@@ -9,6 +9,8 @@ from collections.abc import Callable
 
 import jax
 
+from envs_mjx.errors import UserError
+
 CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 
 
@@ -43,15 +45,15 @@ def release_memory() -> None:
             trim(0)
 
 
-def exit_code(work: Callable[[], object], user_errors: tuple[type[BaseException], ...]) -> int:
-    """0 once a command's work is done; 1 after one line on what the user can mend; 130 after Ctrl-C, whose exception
-    may say how to go on."""
+def exit_code(work: Callable[[], object], *others: type[Exception]) -> int:
+    """0 once a command's work is done; 1 after one line on what the user can mend (`UserError`, an error of the file
+    system, `others`); 130 after Ctrl-C, whose exception may say how to go on."""
     try:
         work()
     except KeyboardInterrupt as stopped:
         print(str(stopped) or "stopped", file=sys.stderr)
         return 130
-    except user_errors as error:
+    except (UserError, OSError, *others) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0

@@ -88,6 +88,13 @@ class SeedRunner:
         iteration = np.ravel(self._states[self.seeds[0]].iteration)[0]
         return self.learner.warmup_steps + int(iteration) * self.learner.config.iteration_steps
 
+    @property
+    def last_step(self) -> int:
+        """Environment steps that every seed will have made at the end of the run: whole chunks after the warm-up."""
+        config, warmup = self.learner.config, self.learner.warmup_steps
+        chunk = self.learner.iterations_per_chunk * config.iteration_steps
+        return warmup + -(-(config.steps - warmup) // chunk) * chunk
+
     def advance(self) -> dict[int, dict[str, float]]:
         """Run one chunk of every seed; metrics by seed."""
         results = self._each(self._chunk, self._states)

@@ -11,11 +11,13 @@ import jax
 from envs_mjx.base import Environment
 from mijax import figures, runtime
 from mijax.config import Stage1Config
-from mijax.metrics import ProgressDisplay, RunError, RunFolder
+from mijax.files import write_atomically
+from mijax.progress import ProgressDisplay
 from mijax.representation import DivergenceError, learn_representation
 from mijax.representation.probe import ProbeReport, format_report, probe
 from mijax.representation.search import SearchResult, draw_candidates, search
-from mijax.representation.storage import FACTS_FILE, load_representation, save_representation, write_atomically
+from mijax.representation.storage import FACTS_FILE, load_representation, save_representation
+from mijax.run_folder import RunError, RunFolder
 from mijax.types import Representation
 
 FOLDER = "representation"
@@ -40,10 +42,9 @@ def reuse(
     what their probes found, into a run.
 
     Raises:
-        RunError: the other run is of another domain, or has no representation of so many features.
-        RepresentationError: one of them is damaged.
+        RunError: the other run has no representation of so many features.
+        RepresentationError: one of them is damaged, or of another domain.
     """
-    source.require(domain=env.name)
     found = [seed for seed in source.seeds() if (folder_of(source, seed) / FACTS_FILE).exists()]
     if not found:
         raise RunError(f"{source.path}: holds no representation (no seed_K/{FOLDER})")

@@ -108,16 +108,25 @@ def markdown_table(lines: Sequence[Mapping[str, str]], hidden: Collection[str] =
     return "\n".join(f"| {text} |" for text in (head, rule, *body))
 
 
-def comparison_table(runs: Sequence[ReportedRun]) -> Table:
+def comparison_table(runs: Sequence[ReportedRun], starts: Mapping[str, int] | None = None) -> Table:
     """How the first of some runs, ours, compares with each: a line per run.
 
     `area` is the mean of the success curve up to the last step that all seeds reached: it tells how early a task is
     learnt. The probability that a seed of ours beats one of theirs, ties counting half, is given by area and by the
     steps to the first evaluation that is solved (never counts as later than any).
+
+    Args:
+        runs: ours first.
+        starts: by label, the random environment steps that a run's features were learnt on before its own steps began.
+            They count, in steps and in areas, there as steps without success.
     """
-    last = min((int(steps[-1]) for run in runs for steps, _ in run.curves("evaluation/success")), default=0)
-    areas = [_areas(run, last) for run in runs]
-    speeds = [_speeds(run) for run in runs]
+    starts = starts or {}
+    begun = [starts.get(run.label, 0) for run in runs]
+    ends = (start + int(steps[-1]) for run, start in zip(runs, begun, strict=True)
+            for steps, _ in run.curves("evaluation/success"))
+    last = min(ends, default=0)
+    areas = [_areas(run, start, last) for run, start in zip(runs, begun, strict=True)]
+    speeds = [_speeds(run, start) for run, start in zip(runs, begun, strict=True)]
     table = []
     for place, run in enumerate(runs):
         seeds = list(run.summary["seeds"].values())
@@ -129,6 +138,8 @@ def comparison_table(runs: Sequence[ReportedRun]) -> Table:
                 line |= {f"{name}_mean": float(mean), f"{name}_std": float(std),
                          f"{name}_iqm": float(statistics.interquartile_mean(scores))}
         line["solved"] = int(np.sum(speeds[place] > -np.inf))
+        middle = float(np.median(-speeds[place])) if len(speeds[place]) else np.inf
+        line["steps_to_solve"] = middle if np.isfinite(middle) else None
         if place:
             for name, scores in (("area", areas), ("steps", speeds)):
                 if len(scores[0]) and len(scores[place]):
@@ -143,15 +154,20 @@ def _column(seeds: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     return np.array([seed[name] for seed in seeds if seed.get(name) is not None], float)
 
 
-def _areas(run: ReportedRun, last: int) -> np.ndarray:
-    """(seeds,) mean success over the steps up to `last`."""
-    return np.array([values[steps <= last].mean() for steps, values in run.curves("evaluation/success")])
+def _areas(run: ReportedRun, start: int, last: int) -> np.ndarray:
+    """(seeds,) mean success over the steps up to `last`, the first `start` of which were stage 1's."""
+    def area(steps: np.ndarray, values: np.ndarray) -> float:
+        apart = (steps[-1] - steps[0]) / max(len(steps) - 1, 1)  # evaluations are evenly spaced
+        evaluations = (last - steps[0]) / apart + 1 if apart else 1.0
+        return float(values[start + steps <= last].sum() / evaluations)
+
+    return np.array([area(steps, values) for steps, values in run.curves("evaluation/success")])
 
 
-def _speeds(run: ReportedRun) -> np.ndarray:
-    """(seeds,) minus the steps to the first solved evaluation; -inf: never."""
+def _speeds(run: ReportedRun, start: int) -> np.ndarray:
+    """(seeds,) minus the steps to the first solved evaluation, with the `start` ones of stage 1; -inf: never."""
     reached = [seed.get("steps_to_solve") for seed in run.summary["seeds"].values()]
-    return np.array([-np.inf if steps is None else -steps for steps in reached], float)
+    return np.array([-np.inf if steps is None else -(start + steps) for steps in reached], float)
 
 
 def _finite(*scores: np.ndarray) -> list[np.ndarray]:
@@ -159,10 +175,10 @@ def _finite(*scores: np.ndarray) -> list[np.ndarray]:
     return [np.where(np.isfinite(values), values, -1e18) for values in scores]
 
 
-def comparison_markdown(runs: Sequence[ReportedRun]) -> str:
+def comparison_markdown(runs: Sequence[ReportedRun], starts: Mapping[str, int] | None = None) -> str:
     """`comparison_table` for reading."""
     lines, first = [], _plain(runs[0].label)
-    for line in comparison_table(runs):
+    for line in comparison_table(runs, starts):
         cells = {"run": line["run"], "seeds": str(line["seeds"])}
         for name in ("success", "return", "reveals", "area"):
             if f"{name}_mean" in line:
@@ -170,15 +186,17 @@ def comparison_markdown(runs: Sequence[ReportedRun]) -> str:
                 cells[name] = f"{readable(line[f'{name}_mean'])}{spread}"
         if "success_iqm" in line:
             cells |= {"success, IQM": readable(line["success_iqm"]), "area, IQM": readable(line.get("area_iqm"))}
-        cells["solved"] = f"{line['solved']}/{line['seeds']}"
+        cells |= {"solved": f"{line['solved']}/{line['seeds']}", "steps to solve": readable(line["steps_to_solve"])}
         for name, title in (("area", f"P({first} better), area"), ("steps", f"P({first} better), steps to solve")):
             if f"p_{name}" in line:
                 low, high = readable(line[f"p_{name}_low"]), readable(line[f"p_{name}_high"])
                 cells[title] = f"{readable(line[f'p_{name}'])} [{low}, {high}]"
         lines.append(cells)
     return (f"{markdown_table(lines)}\n\nMean ± standard deviation over seeds, interquartile mean (IQM). Area: mean of "
-            f"the success curve. Solved: an evaluation with success >= {SOLVED}. P: probability that a seed of the "
-            "first line beats one of this line, ties half, with its 95 % bootstrap interval.\n")
+            f"the success curve. Solved: any evaluation with success >= {SOLVED}; steps to solve: those before the "
+            "first one, the median over seeds. Stage 1's random steps count, without success. P: probability that a seed of "
+            "the first line beats one of this line, ties half, with its 95 % bootstrap interval, which says little of "
+            "three seeds.\n")
 
 
 def plain_markdown(table: Table) -> str:

@@ -18,22 +18,21 @@ import configs
 from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.base import ContinuousActions, Environment
+from envs_mjx.contract import check_contract
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
-from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of
-from mijax.config import Config, ConfigError, config_from_dict, parse_seeds, require
+from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of, unread_groups
+from mijax.config import Config, Stage1Config, options_of, parse_seeds, require
 from mijax.learner import Learner, make_learner
-from mijax.metrics import ProgressDisplay, RunError, RunFolder, TrackerName, make_tracker
-from mijax.representation import DivergenceError
-from mijax.representation.storage import RepresentationError
+from mijax.progress import ProgressDisplay
 from mijax.results import load, summarise
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import SeedRunner, training_key
+from mijax.trackers import TrackerName, make_tracker, require_tracker
+from mijax.trained import Training, stage1_in, training_of
 
 FINAL_EPISODES = 500
 """Greedy episodes of each seed behind the numbers of summary.json."""
-USER_ERRORS = (ConfigError, RunError, RepresentationError, DivergenceError, registry.UnknownDomain,
-               registry.ContractError, OSError)
-"""What a user can mend: shown as one line."""
 
 
 class TrainingError(RunError):
@@ -52,8 +51,8 @@ class TrainOptions:
     out: pathlib.Path | None = None
     """Run folder to make; default runs/DOMAIN-AGENT-MEMORY."""
     resume: pathlib.Path | None = None
-    """Run folder to go on with, under its own options; only --steps may be given with it, and stretches the schedules
-    of step size and imitation."""
+    """Run folder to go on with, under its own options; only --track and --steps may be given with it, and --steps
+    stretches the schedules of step size and imitation."""
     representation: pathlib.Path | None = None
     """Run whose stage 1 is taken over instead of training one."""
     track: TrackerName = "none"
@@ -67,6 +66,7 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
     first.add_argument("--preset", default="default")
     first.add_argument("--resume", type=pathlib.Path)
     first.add_argument("--steps", type=int)
+    first.add_argument("--track")
     known, others = first.parse_known_args(list(arguments))
     if known.resume is not None and not {"-h", "--help"} & set(others):
         return _resumed(known, others, arguments)
@@ -81,17 +81,33 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
 
 def _resumed(known: argparse.Namespace, others: Sequence[str], arguments: Sequence[str]) -> TrainOptions:
     stray = [*others, *(word for word in arguments if word.split("=")[0] in ("--domain", "--preset"))]
-    require(not stray, "resume", " ".join(stray), "no other option than --steps: a run goes on under its own")
+    require(not stray, "resume", " ".join(stray), "no option but --steps and --track: a run goes on under its own")
     run = RunFolder.open(known.resume)
-    stored = run.config()
-    if "agent" not in stored:
-        raise RunError(f"{run.path}: holds representations but no agent to go on with")
-    seeds, track = stored.pop("seed_list"), stored.pop("track")
-    config = config_from_dict(stored)
+    training = training_of(run)
+    config = training.config
     if known.steps is not None:
         require(known.steps >= config.steps, "steps", known.steps, f"at least the run's {config.steps}")
         config = dataclasses.replace(config, steps=known.steps)
-    return TrainOptions(config, seeds=",".join(map(str, seeds)) + ",", resume=known.resume, track=track)
+    seeds = ",".join(map(str, training.seeds)) + ","
+    return TrainOptions(config, seeds=seeds, resume=known.resume, track=known.track or training.track)
+
+
+def unread_options(config: Config, env: Environment) -> list[str]:
+    """Options that differ from both presets, and that the agent never looks at."""
+    ours = configs.preset(config.domain)
+    presets = [options_of(preset) for preset in (ours, paper(ours, not env.observation_spec.is_image))]
+    unread = unread_groups(config, continuous=isinstance(env.action_spec, ContinuousActions))
+    return [f"--{name.replace('_', '-')}" for name, value in options_of(config).items()
+            if name.split(".")[0] in unread and all(preset[name] != value for preset in presets)]
+
+
+def _require_kind(source: RunFolder, wanted: Stage1Config) -> None:
+    """Raise `ConfigError` unless another run's features are of the kind that an agent is about: Believer's or ours."""
+    stored = source.config()
+    other = stage1_of(training_of(source).config) if "agent" in stored else stage1_in(stored)
+    kinds = {True: "Believer's (a KL penalty)", False: "ours (CLUB)"}
+    require((other.lambda_kl > 0) == (wanted.lambda_kl > 0), "representation", str(source.path),
+            f"a run with features of the other kind: {kinds[wanted.lambda_kl > 0]}")
 
 
 def open_run(options: TrainOptions, fill: Callable[[RunFolder], None] | None = None) -> RunFolder:
@@ -102,11 +118,9 @@ def open_run(options: TrainOptions, fill: Callable[[RunFolder], None] | None = N
         if run.config()["steps"] != config.steps:
             run.extend(config.steps)
         return run
-    memory = memory_of(config)
-    name = f"{registry.file_name(config.domain)}-{config.agent}-{memory}"
-    stored = dataclasses.asdict(config) | {
-        "memory": memory, "seed_list": list(parse_seeds(options.seeds)), "track": options.track}
-    return RunFolder.create(options.out or pathlib.Path("runs") / name, stored, fill)
+    name = f"{registry.file_name(config.domain)}-{config.agent}-{memory_of(config)}"
+    training = Training(config, parse_seeds(options.seeds), options.track)
+    return RunFolder.create(options.out or pathlib.Path("runs") / name, training.as_dict(), fill)
 
 
 class CompileClock:
@@ -152,15 +166,21 @@ class StopRequest:
 def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolder:
     """Run or go on with a training; returns its folder."""
     config, seeds = options.config, parse_seeds(options.seeds)
+    require_tracker(options.track)
     env = registry.make(config.domain)
-    registry.check_contract(env)
+    check_contract(env)
     fill = None  # what cannot be trained is refused before anything is written
     warmup = make_learner(env, config).warmup_steps
     require(config.steps > warmup, "steps", config.steps, f"more than the {warmup} of the warm-up")
     if options.representation is not None:
         require(needs_representation(config), "representation", options.representation,
                 f"none: --agent {config.agent} looks through no features here")
-        fill = stage1.reuse(RunFolder.open(options.representation), env, config.stage1.features, seeds)
+        source = RunFolder.open(options.representation)
+        _require_kind(source, stage1_of(config))
+        fill = stage1.reuse(source, env, config.stage1.features, seeds)
+    unread = unread_options(config, env)
+    if unread:
+        say(f"not read by --agent {config.agent} on {env.name}: {', '.join(unread)}")
     run = open_run(options, fill)
     title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))
     say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
@@ -191,6 +211,8 @@ def _start(
         step, states = checkpoint.load_latest(checkpoints, template, say)
         runner.restore(states)
         run.truncate_after(step)
+        for each in checkpoints.values():
+            each.drop_after(step)
         say(f"going on from step {step:,}")
     else:
         run.truncate_after(-1)
@@ -224,7 +246,7 @@ def _loop(
             checkpoints[seed].save(runner.step, state)
 
     try:
-        with ProgressDisplay("stage 2", config.steps, start=runner.step) as progress:
+        with ProgressDisplay("stage 2", runner.last_step, start=runner.step) as progress:
             while runner.step < config.steps and not stop.asked:
                 rows = _advance(runner, config, clock)
                 for seed, row in rows.items():
@@ -306,7 +328,7 @@ def _conclude(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """The command; returns its exit code."""
     def work() -> None:
         options = parse(sys.argv[1:] if arguments is None else arguments)
         seeds, strategy = parse_seeds(options.seeds), options.config.seeds.strategy
@@ -314,7 +336,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runtime.prepare(host_devices=min(runtime.cores(), len(seeds)) if shard else 1)
         train(options)
 
-    return runtime.exit_code(work, USER_ERRORS)
+    return runtime.exit_code(work)
 
 
 if __name__ == "__main__":

@@ -18,19 +18,22 @@ import jax
 import numpy as np
 import tyro
 
+import configs
 from envs_mjx import registry
 from envs_mjx.grid import draw
-from mijax import evaluate, evaluate_robot, runtime
-from mijax.config import parse_seeds, require
+from envs_mjx.robot.gap import GAPS
+from mijax import evaluate_robot, runtime
+from mijax.config import require
 from mijax.learner import Learner, LearnerState, make_learner
-from mijax.metrics import RunError, RunFolder
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
+from mijax.trained import load_learner_state, seeds_of, training_of
 
 if TYPE_CHECKING:
     from envs_mjx.robot.real_trial import Half, Policy, RealEpisode
     from envs_mjx.robot.realworld import RealWorld
+    from envs_mjx.robot.task import RobotTask
 
-GAPS = ("none", "mild", "hard")
 _SAY_EVERY = 10  # episodes
 
 
@@ -102,31 +105,28 @@ def transfer(options: TransferOptions) -> "dict[str, list[Half]]":
     check(options)
     if options.planner:
         assert options.domain is not None
-        evaluate_robot.robot("planner", options.domain)
+        task = evaluate_robot.robot("planner", options.domain)
         folder = f"{registry.file_name(options.domain)}-planner"
         out = options.out or pathlib.Path("runs") / folder / f"transfer_{options.gap}"
         title = f"{options.domain}, the scripted expert, gap {options.gap}"
-        with contextlib.closing(_world(options.domain, options.gap)) as world:
+        with contextlib.closing(_world(task, options.gap)) as world:
             from envs_mjx.robot.real_trial import ExpertPolicy
 
-            return {"planner": _play(world, ExpertPolicy(world.training), jax.random.key(0), options, out, title)}
+            return {"planner": _play(world, ExpertPolicy(task), jax.random.key(0), options, out, title)}
     assert options.run is not None
     run = RunFolder.open(options.run)
-    config = evaluate.config_of(run)
-    require(registry.plain_name(config.domain) in evaluate_robot.DEMONSTRATED.split(", "), "run", str(options.run),
+    config = training_of(run).config
+    require(registry.plain_name(config.domain) in configs.ROBOTS, "run", str(options.run),
             f"a run on a robot task ({evaluate_robot.DEMONSTRATED}), not on {config.domain}")
-    present = run.seeds()
-    seeds = present if options.seeds is None else parse_seeds(options.seeds)
-    missing = [seed for seed in seeds if seed not in present]
-    if missing or not seeds:
-        named = f"no seed {missing[0]}" if missing else "no seed"
-        raise RunError(f"{run.path}: has {named} (it has {', '.join(map(str, present)) or 'none'})")
-    learner = make_learner(registry.make(config.domain), config)
+    seeds = seeds_of(run, options.seeds)
+    task = registry.make(config.domain)
+    assert evaluate_robot.is_robot(task)
+    learner = make_learner(task, config)
     require(not learner.agent.declaration.sees_state, "run", str(options.run),
             f"a run of an agent that sees observations; {config.agent} sees the state, which no robot has")
-    states = {seed: evaluate.load_learner_state(run, seed, learner) for seed in seeds}
+    states = {seed: load_learner_state(run, seed, learner) for seed in seeds}
     rows = {}
-    with contextlib.closing(_world(config.domain, options.gap)) as world:
+    with contextlib.closing(_world(task, options.gap)) as world:
         for seed, (step, state) in states.items():
             out = (options.out or run.path / f"transfer_{options.gap}") / f"seed_{seed}"
             title = f"{config.domain}, {config.agent}, seed {seed}, step {step:,}, gap {options.gap}"
@@ -135,16 +135,15 @@ def transfer(options: TransferOptions) -> "dict[str, list[Half]]":
     return rows
 
 
-def _world(domain: str, gap: str) -> "RealWorld":
-    """The other world of a domain; `RunError` where its cameras have no OpenGL."""
+def _world(task: "RobotTask", gap: str) -> "RealWorld":
+    """The other world of a task; `RunError` where its cameras have no OpenGL."""
     from envs_mjx.robot import headless
 
     if headless.bind() is None:
         raise RunError("no OpenGL without a display: the cameras need EGL or OSMesa (Debian: libegl1 or libosmesa6)")
-    from envs_mjx.robot.gap import GAPS as SIZES
     from envs_mjx.robot.realworld import RealWorld
 
-    return RealWorld(registry.make(domain), SIZES[gap])  # pyright: ignore[reportArgumentType]
+    return RealWorld(task, GAPS[gap])
 
 
 def _play(
@@ -205,11 +204,10 @@ def _films(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    options = tyro.cli(TransferOptions, args=list(arguments), prog="python -m mijax.transfer")
+    """The command; returns its exit code."""
+    options = tyro.cli(TransferOptions, args=arguments, prog="python -m mijax.transfer")
     runtime.prepare()
-    return runtime.exit_code(lambda: transfer(options), evaluate.USER_ERRORS)
+    return runtime.exit_code(lambda: transfer(options))
 
 
 if __name__ == "__main__":

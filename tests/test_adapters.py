@@ -11,8 +11,9 @@ import pytest
 
 from envs_mjx import registry
 from envs_mjx.base import ContinuousActions, Variable
+from envs_mjx.contract import check_contract
 from mijax import train
-from mijax.metrics import RunFolder
+from mijax.run_folder import RunFolder
 
 gymnasium = pytest.importorskip("gymnasium")
 gymnax = pytest.importorskip("gymnax")
@@ -59,7 +60,7 @@ def test_an_episode_from_the_host_is_an_episode():
 @pytest.mark.lenient  # their arithmetic mixes types
 def test_a_gymnax_environment_keeps_our_contract():
     env = registry.make("examples.gymnax_memory:MemoryChain")
-    registry.check_contract(env)
+    check_contract(env)
     assert [(v.name, v.hidden) for v in env.variables] == [("context", True), ("query", False), ("time", False)]
     step = jax.jit(env.step)
     bits = set()
@@ -79,7 +80,7 @@ def test_a_gymnax_environment_keeps_our_contract():
 def test_gymnax_bounds_and_time_limits():
     env = FromGymnax(*gymnax.make("Pendulum-v1"), horizon=3)
     assert isinstance(env.action_spec, ContinuousActions)
-    registry.check_contract(env)
+    check_contract(env)
     state, _ = env.reset(jax.random.key(0))
     for time in range(3):
         state, timestep = env.step(jax.random.key(1), state, jnp.ones((1,)))
@@ -112,7 +113,7 @@ def play(env: FromGymnasium, keys: jax.Array, actions: jax.Array) -> tuple:
 def test_a_gymnasium_environment_keeps_our_contract():
     check_env(TMaze(), skip_render_check=True)
     env = registry.make("examples.gymnasium_memory:Maze")
-    registry.check_contract(env)
+    check_contract(env)
     actions = jnp.array([[0] * 8] * LENGTH + [[1] * 8] + [[0] * 8] * 2, jnp.int32)  # left, then two steps too many
     moment, steps = play(Maze(), jax.random.split(jax.random.key(0), 8), actions)
     side = np.asarray(moment.state[:, 1])
@@ -154,7 +155,7 @@ def test_gymnasium_bounds_and_time_limits():
     env = FromGymnasium(functools.partial(gymnasium.make, "Pendulum-v1"), horizon=3)
     assert isinstance(env.action_spec, ContinuousActions)
     assert (env.name, env.observation_spec.shape) == ("Pendulum-v1", (3,))
-    registry.check_contract(env)
+    check_contract(env)
     moment, steps = play(env, jax.random.split(jax.random.key(0), 1), jnp.ones((3, 1, 1)))
     theirs = gymnasium.make("Pendulum-v1")
     theirs.reset(seed=int(moment.seed[0]))

@@ -11,9 +11,9 @@ import pytest
 
 from envs_mjx import registry
 from envs_mjx.base import ContinuousActions, DiscreteActions, Variable
-from mijax import evaluate
-from mijax.metrics import RunError, RunFolder
+from envs_mjx.contract import check_contract
 from mijax.results import load, summarise
+from mijax.run_folder import RunError, RunFolder
 
 pytest.importorskip("brax")
 
@@ -21,6 +21,7 @@ from brax.envs import base, fast, training
 
 from envs_mjx.adapters.brax import AsBrax, FromBrax, on_recent_jax, wrap
 from examples import brax_ppo
+from mijax.trained import training_of
 
 
 @pytest.fixture(autouse=True)
@@ -167,7 +168,7 @@ class CartPlace(FromBrax):
 @pytest.mark.lenient
 def test_an_environment_of_brax_keeps_our_contract():
     env = CartPlace()
-    registry.check_contract(env)
+    check_contract(env)
     assert isinstance(env.action_spec, ContinuousActions)
     assert env.action_spec.size == 1
     assert (env.observation_spec.shape, env.state_spec.shape) == ((1,), (2,))
@@ -189,7 +190,7 @@ def test_an_environment_of_brax_keeps_our_contract():
 @pytest.mark.lenient
 def test_a_part_of_one_observation_is_what_a_policy_sees():
     env = FromBrax(fast.Fast(), horizon=4, observed=(0,))
-    registry.check_contract(env)
+    check_contract(env)
     assert (env.observation_spec.shape, env.state_spec.shape) == ((1,), (2,))
     assert [variable.hidden for variable in env.variables] == [False, True]
     both = FromBrax(fast.Fast(asymmetric_obs=True, obs_mode="dict_state"), horizon=4)  # pyright: ignore
@@ -227,7 +228,7 @@ def test_ppo_with_a_privileged_critic_writes_a_run_like_ours(tmp_path: pathlib.P
     assert load([run.path])[0].curves("evaluation/return")
     assert (run.path / "curve.png").exists()
     with pytest.raises(RunError, match="its agent 'ppo' is another program's"):
-        evaluate.config_of(run)
+        training_of(run)
     with pytest.raises(RunError, match="already holds a run"):
         brax_ppo.train(options)
     assert brax_ppo.main(["--out", str(run.path)]) == 1

@@ -209,6 +209,16 @@ def test_files_give_the_same_observation(images: np.ndarray, recorded: pathlib.P
         assert picture.size == (84, 84)
 
 
+@pytest.mark.parametrize(("domain", "pad"), [("block_pushing", ()), ("drawer_opening", ("--pad", "0.5", "0.1"))])
+def test_the_pads_place_belongs_to_the_task_that_has_one(
+    recorded: pathlib.Path, capsys: pytest.CaptureFixture[str], domain: str, pad: tuple[str, ...]
+) -> None:
+    arguments = [str(recorded / "left.png"), "--calibration", str(recorded / "cameras.json"), "--domain", domain,
+                 "--gripper", *map(str, GRIPPER), *pad]
+    assert camera_files.main(arguments) == 1
+    assert capsys.readouterr().err == "error: --pad: accepted with --domain block_pushing, and needed there\n"
+
+
 def test_text_clouds(recorded: pathlib.Path) -> None:
     np.testing.assert_array_equal(camera_files.read_ply(recorded / "text.ply"), [[1, 2, 0.25], [3, 4, 0.5]])
 

@@ -1,77 +1,27 @@
 """The Double-DQN core against targets worked out by loops over an episode."""
 
 import dataclasses
-import inspect
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tokens import CONTINUOUS, DISCRETE, FEATURES, ROW, SPANS, TINY, AgentCase, Shapes, episodes, representation
 
-from envs_mjx.base import ArraySpec, DiscreteActions, Environment
 from mijax.agents.dqn import DQN, AgentState, make_dqn
-from mijax.config import Config, ConfigError, DQNConfig, InformationConfig, NetworkConfig, Stage1Config
-from mijax.representation.model import init_parameters, networks_for
-from mijax.types import Representation, Tokens
+from mijax.config import Config, ConfigError, DQNConfig, InformationConfig, Stage1Config
 
-ACTIONS, FEATURES, ROW, GAMMA = 3, 4, 6, 0.9
-TINY = NetworkConfig(action_embedding=4, observation_embedding=4, gru_width=8, critic_hidden=(16,),
-                     auxiliary_hidden=(16,), dropout=0.0)
 CONFIG = Config(
-    memory="gru", stage1=Stage1Config(features=FEATURES), network=TINY, dqn=DQNConfig(discount=GAMMA, target_rate=0.1),
+    memory="gru", stage1=Stage1Config(features=FEATURES), network=TINY, dqn=DQNConfig(discount=0.9, target_rate=0.1),
     information=InformationConfig(intrinsic_weight=0.5, auxiliary_weight=0.25, folds=2),
 )
 BASE = dataclasses.replace(CONFIG, agent="base")
-
-
-class Shapes(Environment):
-    """Nothing but shapes."""
-
-    name, horizon, action_spec = "shapes", ROW - 1, DiscreteActions(ACTIONS)
-    observation_spec, state_spec = ArraySpec((2,)), ArraySpec((3,))
-
-    def reset(self, key):
-        raise NotImplementedError
-
-    def step(self, key, env_state, action):
-        raise NotImplementedError
-
-
-def representation() -> Representation:
-    """Untrained encoders, a mean that is not 0 and a variance that is not 1."""
-    zeros = [jnp.zeros((1, *spec.shape)) for spec in (Shapes.state_spec, Shapes.observation_spec)]
-    parameters = init_parameters(networks_for(Shapes(), FEATURES), jax.random.key(5), *zeros)
-    mean = jnp.arange(FEATURES, dtype=jnp.float32)
-    return Representation(parameters["phi"], parameters["psi"], mean, jnp.float32(2.0))
-
-
-def episodes() -> Tokens:
-    """Row 0: episodes of 3 steps and of 1 step, both terminated; row 1: one of 4 steps, truncated, and padding."""
-    rng = np.random.default_rng(0)
-    segment = np.array([[1, 1, 1, 1, 2, 2], [3, 3, 3, 3, 3, 0]])
-    position = np.array([[0, 1, 2, 3, 0, 1], [0, 1, 2, 3, 4, 0]])
-    terminated, truncated = np.zeros((2, *segment.shape), bool)
-    terminated[0, 3] = terminated[0, 5] = truncated[1, 4] = True
-    action = rng.integers(0, ACTIONS, segment.shape)
-    return Tokens(
-        frames=jnp.asarray(rng.normal(size=(segment.size, 2)), jnp.float32),
-        frame=None,
-        previous_action=jnp.asarray(np.where(position == 0, -1, action), jnp.int32),
-        reward=jnp.asarray(rng.normal(size=segment.shape), jnp.float32),
-        terminated=jnp.asarray(terminated),
-        truncated=jnp.asarray(truncated),
-        segment=jnp.asarray(segment, jnp.int32),
-        position=jnp.asarray(position, jnp.int32),
-        z_s=jnp.asarray(rng.normal(size=(*segment.shape, FEATURES)), jnp.float32),
-    )
-
-
-SPANS = ((0, 0, 4), (0, 4, 6), (1, 0, 5))  # row, first token, end: the three episodes
+SHAPES = Shapes(DISCRETE)
 
 
 def agent_of(config: Config) -> DQN:
-    return make_dqn(Shapes(), config)
+    return make_dqn(SHAPES, config)
 
 
 def changed(config: Config, **dqn: Any) -> Config:
@@ -80,20 +30,13 @@ def changed(config: Config, **dqn: Any) -> Config:
 
 @pytest.fixture(scope="module")
 def states() -> dict[str, AgentState]:
-    """Agents with random parameters, whose target networks have other parameters than the online ones."""
-    made = {}
-    for config in (CONFIG, BASE):
-        agent, rng = agent_of(config), np.random.default_rng(7)
-        shapes = jax.eval_shape(agent.init, jax.random.key(0), representation() if config.agent == "mi" else None)
-        params, target = jax.tree.map(
-            lambda x, rng=rng: jnp.asarray(rng.normal(0, 0.3, x.shape), x.dtype), (shapes.params, shapes.target))
-        made[config.agent] = AgentState(params, target, agent.optimizer.init(params), jnp.zeros((), jnp.int32))
-    return made
+    """Of `mi` and `base`, with random parameters."""
+    return {config.agent: AgentCase(make_dqn, DISCRETE, config).state for config in (CONFIG, BASE)}
 
 
 def loss_by_loops(q: Any, q_target: Any, bonus: np.ndarray, dqn: DQNConfig) -> tuple[float, int]:
     """The TD loss transition by transition, and how many traces were cut at an action that was not greedy."""
-    tokens = jax.device_get(episodes())
+    tokens = jax.device_get(episodes(DISCRETE))
     errors, cut = [], 0
     for row, first, end in SPANS:
         later = 0.0
@@ -115,7 +58,7 @@ def loss_by_loops(q: Any, q_target: Any, bonus: np.ndarray, dqn: DQNConfig) -> t
     ("bootstrap", "trace_decay", "bound"), [(False, 0.0, 0.0), (True, 0.7, 0.0), (True, 0.7, 0.1)])
 def test_td_loss_by_hand(states: dict[str, AgentState], bootstrap: bool, trace_decay: float, bound: float):
     config = changed(BASE, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay, value_bound=bound)
-    agent, state, tokens = agent_of(config), states["base"], episodes()
+    agent, state, tokens = agent_of(config), states["base"], episodes(DISCRETE)
     network: Any = jax.jit(agent.network.apply)
     q, q_target = (network({"params": p}, tokens).q for p in (state.params["agent"], state.target))
     expected, cut = loss_by_loops(q, q_target, np.zeros((2, ROW)), config.dqn)
@@ -129,7 +72,7 @@ def test_td_loss_by_hand(states: dict[str, AgentState], bootstrap: bool, trace_d
 @pytest.mark.parametrize("form", ["explained_variance", "cosine"])
 def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: Any):
     config = dataclasses.replace(CONFIG, information=dataclasses.replace(CONFIG.information, intrinsic_form=form))
-    agent, state, tokens, rep = agent_of(config), states["mi"], episodes(), representation()
+    agent, state, tokens, rep = agent_of(config), states["mi"], episodes(DISCRETE), representation(SHAPES)
     assert agent.information_model is not None
     network: Any = jax.jit(agent.network.apply)
     online, averaged = (network({"params": p}, tokens) for p in (state.params["agent"], state.target))
@@ -164,7 +107,7 @@ def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: A
 
 def test_f_learns_from_its_own_loss_only(states: dict[str, AgentState]):
     """The bonus is a reward: no gradient of the TD loss reaches f, and none of f's loss reaches the agent."""
-    agent, state, tokens, rep = agent_of(CONFIG), states["mi"], episodes(), representation()
+    agent, state, tokens, rep = agent_of(CONFIG), states["mi"], episodes(DISCRETE), representation(SHAPES)
 
     @jax.jit
     def gradients(params: Any) -> tuple[Any, Any]:
@@ -183,7 +126,7 @@ def test_f_learns_from_its_own_loss_only(states: dict[str, AgentState]):
 def test_updates_move_the_target_a_little_and_learn_a_batch_by_heart(states: dict[str, AgentState]):
     config = changed(CONFIG, learning_rate=1e-2)
     config = dataclasses.replace(config, information=dataclasses.replace(config.information, intrinsic_weight=0.01))
-    agent, state, tokens, rep = agent_of(config), states["mi"], episodes(), representation()
+    agent, state, tokens, rep = agent_of(config), states["mi"], episodes(DISCRETE), representation(SHAPES)
     update = jax.jit(agent.update)
     after, first = update(state, tokens, rep, jax.random.key(0))
 
@@ -201,7 +144,7 @@ def test_updates_move_the_target_a_little_and_learn_a_batch_by_heart(states: dic
 
 
 def test_loss_under_vmap_equals_one_by_one(states: dict[str, AgentState]):
-    agent, tokens, state = agent_of(BASE), episodes(), states["base"]
+    agent, tokens, state = agent_of(BASE), episodes(DISCRETE), states["base"]
     both = jax.tree.map(lambda x: jnp.stack([x, x * 1.1]), state.params)
 
     def loss(params: Any) -> jax.Array:
@@ -211,7 +154,8 @@ def test_loss_under_vmap_equals_one_by_one(states: dict[str, AgentState]):
 
 
 def test_the_memoryless_branch_starts_from_psi_only_when_asked():
-    rep, fresh = representation(), dataclasses.replace(CONFIG, information=InformationConfig(start_from_psi=False))
+    fresh = dataclasses.replace(CONFIG, information=InformationConfig(start_from_psi=False))
+    rep = representation(SHAPES)
 
     @jax.jit
     def bottoms(key: jax.Array) -> list[Any]:
@@ -226,14 +170,8 @@ def test_the_memoryless_branch_starts_from_psi_only_when_asked():
 
 def test_the_plain_agent_has_no_use_for_a_representation():
     init = agent_of(BASE).init
-    without, with_one = (jax.eval_shape(init, jax.random.key(0), rep) for rep in (None, representation()))
+    without, with_one = (jax.eval_shape(init, jax.random.key(0), rep) for rep in (None, representation(SHAPES)))
     assert without == with_one
-
-
-def test_acting_sees_no_state():
-    assert list(inspect.signature(DQN.act).parameters) == [
-        "self", "params", "memory", "observation", "previous_action"]
-    assert "state" not in inspect.signature(DQN.explore).parameters
 
 
 def test_the_value_is_the_best_action_s(states: dict[str, AgentState]):
@@ -255,16 +193,13 @@ def test_exploration(states: dict[str, AgentState]):
     shares = {}
     for epsilon in (0.0, 0.5, 1.0):
         _, action = explore(params, memory, observation, none, jnp.float32(epsilon), jax.random.key(0))
-        shares[epsilon] = np.bincount(action, minlength=ACTIONS)[next(iter(greedy))] / num
+        shares[epsilon] = np.bincount(action, minlength=DISCRETE.num)[next(iter(greedy))] / num
         assert action.dtype == jnp.int32
     assert shares[0.0] == 1
-    assert shares[0.5] == pytest.approx(0.5 + 0.5 / ACTIONS, abs=0.05)
-    assert shares[1.0] == pytest.approx(1 / ACTIONS, abs=0.05)
+    assert shares[0.5] == pytest.approx(0.5 + 0.5 / DISCRETE.num, abs=0.05)
+    assert shares[1.0] == pytest.approx(1 / DISCRETE.num, abs=0.05)
 
 
 def test_continuous_actions_are_refused():
-    class Continuous(Shapes):
-        action_spec: Any = "continuous"
-
     with pytest.raises(ConfigError, match="continuous actions"):
-        make_dqn(Continuous(), CONFIG)
+        make_dqn(Shapes(CONTINUOUS), CONFIG)

@@ -1,5 +1,6 @@
 """One conformance suite over every registered environment, and the registry's errors."""
 
+import dataclasses
 import functools
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 import configs
 from envs_mjx import registry
 from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, EnvState, TimeStep
+from envs_mjx.contract import ContractError, check_contract
 from envs_mjx.grid import HeavenHell
 from envs_mjx.grid.world import GridState, GridWorld
 
@@ -37,7 +39,7 @@ def episodes(request: pytest.FixtureRequest) -> Episodes:
 
     def play(key):
         keys = jax.random.split(key, env.horizon)
-        actions = jax.vmap(lambda k: registry.sample_action(env, k))(keys)
+        actions = jax.vmap(env.action_spec.sample)(keys)
         first = env.reset(key)
 
         def step(env_state, inputs):
@@ -55,7 +57,7 @@ def episodes(request: pytest.FixtureRequest) -> Episodes:
 
 
 def test_check_contract(episodes: Episodes) -> None:
-    registry.check_contract(episodes.env)
+    check_contract(episodes.env)
 
 
 def test_names_are_the_registered_ones() -> None:
@@ -197,7 +199,7 @@ def test_environment_of_the_current_directory(tmp_path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     env = registry.make("my_worlds:Mine")
-    registry.check_contract(env)
+    check_contract(env)
     assert env.name == "mine"
     (tmp_path / "lazy_worlds.py").write_text("def __getattr__(name):\n    raise ImportError('no physics here')\n")
     with pytest.raises(registry.UnknownDomain, match="importing 'lazy_worlds' failed: ImportError: no physics here"):
@@ -239,6 +241,23 @@ def _with(**attributes):
     return type("Broken", (HeavenHell,), attributes)()
 
 
+def _resetting(where: int, shown_only: bool = False):
+    """Heaven-Hell, short, whose step resets at the end: with its own key, or the first or second split from it."""
+
+    class Resetting(HeavenHell):
+        horizon = 5
+
+        def step(self, key, env_state, action):
+            env_state, last = super().step(key, env_state, action)
+            begun, first = self.reset([key, *jax.random.split(key)][where])
+            first = dataclasses.replace(
+                first, reward=last.reward, terminated=last.terminated, truncated=last.truncated)
+            begun, shown = jax.tree.map(lambda x, y: jnp.where(last.done, x, y), (begun, first), (env_state, last))
+            return env_state if shown_only else begun, shown
+
+    return Resetting()
+
+
 @pytest.mark.parametrize(("env", "message"), [
     (_with_timestep(reward=lambda x: x.astype(jnp.int32)), r"reward of step is 'int32\[\]', expected float32\[\]"),
     (_with_timestep(reward=lambda x: x[None]), r"reward of step is 'float32\[1\]', expected float32\[\]"),
@@ -247,6 +266,12 @@ def _with(**attributes):
     (_with_timestep(observation=lambda x: x / 0), "observation of step is 'not finite'"),
     (_with(state_spec=ArraySpec((4,))), r"state of reset is 'float32\[3\]', expected float32\[4\]"),
     (_with(horizon=0), "horizon is 0, expected at least 1"),
+    (_with_timestep(truncated=jnp.zeros_like), "an episode is not over after its horizon of 50 steps"),
+    *((_resetting(where), "step returns the first moment of a new episode where one ends") for where in range(3)),
+    (_resetting(0, shown_only=True), "step returns the first moment of a new episode where one ends"),
+    (_with(observation_spec=ArraySpec((3, 1))), r"observation_spec is \(3, 1\), expected a vector \(D,\) or an image"),
+    (_with(state_spec=ArraySpec(())), r"state_spec is \(\), expected a vector"),
+    (_with(__eq__=lambda self, other: True, __hash__=None), "cannot be hashed, as programs compiled for it"),
     (_with(action_spec=ContinuousActions(2)), "step cannot be traced by JAX"),
     (_with(variables=()), r"ground_truth is 'float32\[3\]', expected float32\[0\]"),
     (_with(ground_truth=lambda self, env_state: jnp.array([2.0, 0.0, 0.0])),
@@ -270,6 +295,6 @@ def _with(**attributes):
 ])
 @pytest.mark.lenient
 def test_broken_contracts(env: Environment, message: str) -> None:
-    with pytest.raises(registry.ContractError, match=message) as caught:
-        registry.check_contract(env)
+    with pytest.raises(ContractError, match=message) as caught:
+        check_contract(env)
     assert "\n" not in str(caught.value)

@@ -17,12 +17,13 @@ from mijax.checkpoint import Checkpoints
 from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig, Stage1Config
 from mijax.episode import Trace, trace
 from mijax.learner import Learner, LearnerState, make_learner
-from mijax.metrics import RunFolder
 from mijax.representation import learn_representation
 from mijax.representation.model import init_parameters, networks_for
 from mijax.representation.storage import save_representation
+from mijax.run_folder import RunFolder
 from mijax.seeds import training_key
 from mijax.stage1 import folder_of
+from mijax.trained import Training
 from mijax.types import Representation
 
 STAGE1 = Stage1Config(episodes=20, epochs=1, batch_size=200, features=4)
@@ -99,7 +100,7 @@ def test_the_command_draws_an_episode_of_each_kind(
 ) -> None:
     learner, state = ours
     config = dataclasses.replace(CONFIG, agent=agent, memory=memory)
-    run = RunFolder.create(tmp_path / "run", dataclasses.asdict(config) | {"seed_list": [2], "track": "none"})
+    run = RunFolder.create(tmp_path / "run", Training(config, (2,)).as_dict())
     if agent == "base":
         learner = make_learner(learner.env, config)
         state = jax.jit(learner.init)(training_key(2), None)
@@ -150,10 +151,10 @@ def test_continuous_actions_are_traced() -> None:
 
 
 def test_what_cannot_be_drawn_is_named(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = RunFolder.create(tmp_path / "run", dataclasses.asdict(CONFIG) | {"seed_list": [0], "track": "none"})
+    run = RunFolder.create(tmp_path / "run", Training(CONFIG, (0,)).as_dict())
     run.seed_path(0).mkdir()
     for arguments, message in (
-        ([str(run.path), "--seed", "4"], "--seed: got 4, accepted: 0"),
+        ([str(run.path), "--seed", "4"], "has no seed 4 (it has 0)"),
         ([str(run.path), str(run.path)], "--episode: got 2 runs, accepted: one"),
         ([str(run.path)], "seed 0 has no checkpoint yet"),
     ):

@@ -1,6 +1,5 @@
 """Checkpoints of a run are played, tabled and drawn."""
 
-import dataclasses
 import json
 import pathlib
 
@@ -17,8 +16,9 @@ from mijax.agents.forgetful import Forgetful
 from mijax.checkpoint import Checkpoints
 from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig
 from mijax.learner import make_learner
-from mijax.metrics import RunFolder
+from mijax.run_folder import RunFolder
 from mijax.seeds import evaluation_key, training_key
+from mijax.trained import Training, load_learner_state
 
 CONFIG = Config(
     agent="base", memory="gru", steps=1000,
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.lenient
 def run(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A run of seeds 0 and 3 that was stopped before its first update."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    folder = RunFolder.create(path, dataclasses.asdict(CONFIG) | {"seed_list": [0, 3], "track": "none"})
+    folder = RunFolder.create(path, Training(CONFIG, (0, 3)).as_dict())
     init = jax.jit(LEARNER.init)
     for seed in (0, 3):
         checkpoints = Checkpoints(folder, seed)
@@ -59,7 +59,7 @@ def test_the_table_holds_what_the_learner_measures(run: pathlib.Path, capsys: py
     assert head.split() == ["seed", "step", "success", "return", "discounted", "return", "of", "optimum", "length",
                             "reveals"]
     assert [line.split()[0] for line in lines] == ["0", "3", "mean"]
-    _, state = evaluate.load_learner_state(RunFolder.open(run), 3, LEARNER)
+    _, state = load_learner_state(RunFolder.open(run), 3, LEARNER)
     results = jax.jit(LEARNER.evaluate, static_argnums=2)(state, evaluation_key(3, STEP), 32)
     means = {name: float(np.mean(values)) for name, values in results.items()}
     best = optimum(LEARNER.env, CONFIG.evaluation.discount)
@@ -98,7 +98,7 @@ def test_a_cut_memory_is_an_episode_that_began_later():
 def test_an_episode_is_drawn_and_printed(run: pathlib.Path, capsys: pytest.CaptureFixture[str]):
     assert evaluate.main([str(run), "--seeds", "3,", "--episodes", "4", "--gif", "--text"]) == 0
     said = capsys.readouterr().out
-    _, state = evaluate.load_learner_state(RunFolder.open(run), 3, LEARNER)
+    _, state = load_learner_state(RunFolder.open(run), 3, LEARNER)
     states = evaluate.play(LEARNER, state, evaluation_key(3, STEP))
     times = [int(env_state.time) for env_state in states]
     assert times == list(range(len(times)))
@@ -119,13 +119,13 @@ def test_what_cannot_be_evaluated_is_named(
     assert "--remember: got -1" in failure(capsys, str(run), "--remember", "-1")
     assert "--episodes: got 0" in failure(capsys, str(run), "--episodes", "0")
     assert "has no seed 7 (it has 0, 3)" in failure(capsys, str(run), "--seeds", "0,7")
-    fresh = RunFolder.create(tmp_path / "fresh", dataclasses.asdict(CONFIG) | {"seed_list": [0], "track": "none"})
+    fresh = RunFolder.create(tmp_path / "fresh", Training(CONFIG, (0,)).as_dict())
     assert "has no seed (it has none)" in failure(capsys, str(fresh.path))
     fresh.seed_path(0).mkdir()
     assert "seed 0 has no checkpoint yet" in failure(capsys, str(fresh.path))
     assert not (fresh.seed_path(0) / "checkpoints").exists()
     representation = RunFolder.create(tmp_path / "represented", {"domain": "sphinx", "stage1": {}})
-    assert "no agent to evaluate" in failure(capsys, str(representation.path))
+    assert "holds representations but no agent" in failure(capsys, str(representation.path))
     stored = json.loads((fresh.path / "config.json").read_text())
     (fresh.path / "config.json").write_text(json.dumps(stored | {"domain": "mars"}))
     assert "'mars'" in failure(capsys, str(fresh.path))

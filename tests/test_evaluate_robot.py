@@ -12,9 +12,10 @@ from PIL import Image
 
 import configs
 from envs_mjx import registry
+from envs_mjx.grid import HeavenHell
 from envs_mjx.robot import film, page
 from envs_mjx.robot.task import RobotState, RobotTask
-from mijax import evaluate
+from mijax import evaluate, evaluate_robot
 
 LIBRARY = "export const x = 1; // import {y} from './animator.js'"
 
@@ -55,6 +56,14 @@ def test_what_does_not_go_together_is_named(
     arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert message in failure(capsys, *arguments)
+
+
+def test_a_robot_is_known_by_its_type(moment: tuple[RobotTask, RobotState]) -> None:
+    """An environment of a user's own may have physics as well."""
+    other = HeavenHell()
+    vars(other)["physics"] = "of its own"
+    assert evaluate_robot.is_robot(moment[0])
+    assert not evaluate_robot.is_robot(other)
 
 
 def test_pictures_of_an_episode(moment: tuple[RobotTask, RobotState]) -> None:

@@ -25,8 +25,9 @@ from mijax.deploy import numpy_policy, parity, trace
 from mijax.deploy.numpy_policy import FILES, NEXT, Policy, PolicyError, Program, Refused
 from mijax.deploy.step import contract, observation_range, policy_step
 from mijax.learner import make_learner
-from mijax.metrics import RunError, RunFolder
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import training_key
+from mijax.trained import Training
 from mijax.types import Params
 
 pytestmark = pytest.mark.lenient
@@ -225,7 +226,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
         batch_episodes=4, warmup_episodes=4, replay_steps=400))
     learner = make_learner(registry.make("heaven_hell"), config)
     path = tmp_path_factory.mktemp("runs") / "run"
-    folder = RunFolder.create(path, dataclasses.asdict(config) | {"seed_list": [0, 3], "track": "none"})
+    folder = RunFolder.create(path, Training(config, (0, 3)).as_dict())
     init = jax.jit(learner.init)
     for seed in (0, 3):
         checkpoints = Checkpoints(folder, seed)

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tokens import DISCRETE, Shapes, random_like
 
-from envs_mjx.base import ArraySpec, DiscreteActions, Environment
+from envs_mjx.base import ArraySpec
 from mijax.agents.dqn import DQN, make_dqn
 from mijax.config import Config, MemoryName, NetworkConfig, Stage1Config
 from mijax.frames import FrameTable
@@ -20,31 +21,16 @@ from mijax.types import Params, Tokens
 
 LENGTHS = (3, 8, 5, 2)
 ROW = 8  # tokens of a full-length episode
-ACTIONS, FEATURES = 3, 5
+FEATURES = 5
 VECTOR, IMAGE = ArraySpec((2,)), ArraySpec((4, 4, 2), np.uint8)
 TINY = NetworkConfig(layers=2, action_embedding=4, observation_embedding=4, gru_width=6, critic_hidden=(8,),
                      auxiliary_hidden=(8,))
 MEMORIES: tuple[MemoryName, ...] = ("gpt", "gru")
 
 
-class Shapes(Environment):
-    """Nothing but the shapes that networks are made for."""
-
-    name, horizon, action_spec, state_spec = "shapes", ROW - 1, DiscreteActions(ACTIONS), VECTOR
-
-    def __init__(self, observation_spec: ArraySpec) -> None:
-        self.observation_spec = observation_spec
-
-    def reset(self, key):
-        raise NotImplementedError
-
-    def step(self, key, env_state, action):
-        raise NotImplementedError
-
-
 def agent_of(memory: MemoryName, spec: ArraySpec = VECTOR, network: NetworkConfig = TINY) -> DQN:
     config = Config(agent="mi", memory=memory, network=network, stage1=Stage1Config(features=FEATURES))
-    return make_dqn(Shapes(spec), config)
+    return make_dqn(Shapes(DISCRETE, spec, VECTOR, ROW - 1), config)
 
 
 def stored_episodes(spec: ArraySpec = VECTOR) -> Replay:
@@ -52,7 +38,7 @@ def stored_episodes(spec: ArraySpec = VECTOR) -> Replay:
     rng = np.random.default_rng(0)
     shape = (len(LENGTHS), ROW)
     observation = rng.integers(0, 2, (*shape, *spec.shape)) if spec.is_image else rng.normal(size=(*shape, *spec.shape))
-    previous_action = rng.integers(0, ACTIONS, shape)
+    previous_action = rng.integers(0, DISCRETE.num, shape)
     previous_action[:, 0] = -1
     data = StepRecord(
         observation=jnp.asarray(observation, spec.dtype),
@@ -91,9 +77,7 @@ def of_episodes(x: jax.Array, layout: Layout) -> np.ndarray:
 
 def some_parameters(module: nn.Module, tokens: Tokens) -> Params:
     """Parameters large enough that attention is not uniform."""
-    rng = np.random.default_rng(1)
-    shapes = jax.eval_shape(module.init, jax.random.key(1), tokens)["params"]
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(0, 0.4, x.shape), x.dtype), shapes)
+    return random_like(jax.eval_shape(module.init, jax.random.key(1), tokens)["params"], 0.4)
 
 
 @pytest.fixture(scope="module", params=MEMORIES)
@@ -132,7 +116,7 @@ def case(memory: MemoryName) -> Case:
 
 
 def test_outputs_have_a_value_per_token(case: Case):
-    assert case.q.shape == (len(LENGTHS), ROW, ACTIONS)
+    assert case.q.shape == (len(LENGTHS), ROW, DISCRETE.num)
     assert case.predicted.shape == (len(LENGTHS), ROW, FEATURES)
     assert case.q.dtype == case.predicted.dtype == jnp.float32
 

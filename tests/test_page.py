@@ -19,9 +19,9 @@ from mijax import page, report, results
 from mijax.config import Config
 from mijax.episode import Trace
 from mijax.learner import make_learner
-from mijax.metrics import RunError, RunFolder
 from mijax.page import episodes
 from mijax.results import ReportedRun
+from mijax.run_folder import RunError, RunFolder
 
 LENGTH, TOLD = 6, 4
 CELLS = (24, 31, 32, 33, 34, 33, 32)
@@ -189,7 +189,7 @@ def test_the_command_tells_why_there_is_no_episode(tmp_path: pathlib.Path, capsy
     assert "seed 0 has no checkpoint yet" in page.read_data(run.path / page.FILE)["runs"][0]["episodes"]
     for arguments, message in (
         (["--html", "--episode"], "--html: got it with --episode"),
-        (["--html", "--seed", "9"], "--seed: got 9, accepted: 0, 1, 2"),
+        (["--html", "--seed", "9"], "has no seed 9 (it has 0, 1, 2)"),
     ):
         assert report.main([str(run.path), *arguments]) == 1
         error = capsys.readouterr().err.splitlines()

@@ -11,8 +11,8 @@ from PIL import Image
 from launch import paper
 from launch.experiments import AGENTS, DOMAINS, EXPERIMENTS, ablations, memories, overlap, parts
 from mijax import tables
-from mijax.metrics import RunError, RunFolder
 from mijax.results import ReportedRun
+from mijax.run_folder import RunError, RunFolder
 
 TINY = (
     "--network.action-embedding", "4", "--network.observation-embedding", "4", "--network.critic-hidden", "8",
@@ -191,3 +191,6 @@ def test_the_table_compares_ours_with_each() -> None:
     np.testing.assert_allclose(worse["area_std"], np.std([0.0, 0.5], ddof=1))
     text = tables.comparison_markdown([run("ours", [10, 20]), run("worse", [None, 30])])
     assert "1.000 [1.000, 1.000]" in text
+    later, same, _ = tables.comparison_table(runs, {"ours": 20})  # solved at 30 and 40, two of four evaluations left
+    assert (later["area_mean"], later["steps_to_solve"]) == (0.375, 35)
+    assert (same["area_mean"], same["p_steps"], same["p_area"]) == (0.875, 0.0, 0.0)

@@ -3,10 +3,11 @@
 import csv
 
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from mijax import report, results
-from mijax.metrics import RunError, RunFolder
+from mijax.run_folder import RunError, RunFolder
 
 OPTIMUM = {"return": 1.0, "discounted_return": 0.8, "success": 1.0}
 
@@ -122,11 +123,17 @@ def test_domains_have_figures_of_their_own(tmp_path):
     assert figures == {"curve_heaven_hell.png", "curve_mine.envs.Maze.png"}
 
 
-def test_curves_of_different_lengths_are_drawn(tmp_path):
+def test_curves_of_different_lengths_are_drawn(tmp_path, monkeypatch):
+    """Every seed to its own end; their mean as far as there are all of them."""
     run = make_run(tmp_path / "a", finished=False)
     run.append(2, {"step": 12_345, "evaluation/success": 1.0})
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: figures.append(figure))
     report.write_report(results.load([run.path]), tmp_path / "out")
-    assert (tmp_path / "out" / "curve.png").stat().st_size > 10_000
+    success = next(axis for axis in figures[0].axes if axis.get_ylabel() == "success")
+    ends = sorted(float(line.get_xdata()[-1]) for line in success.lines)
+    assert ends == [10_000] * 3 + [12_345]  # two seeds and the mean, and the third
+    assert success.get_xlim() == (0, 12_345)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -12,9 +12,9 @@ import pytest
 import configs
 from configs.paper import paper
 from envs_mjx import registry
-from envs_mjx.robot import BlockPushing, DrawerOpening, scene
+from envs_mjx.robot import BlockPulling, BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
-from envs_mjx.robot.planner import PLANS, Planner, PlannerState, Trajectory, demonstrations
+from envs_mjx.robot.planner import Planner, PlannerState, Trajectory, demonstrations
 from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotState, RobotTask
 from envs_mjx.robot.trial import policy_trial
 from mijax.demonstrations import demonstrate
@@ -42,9 +42,7 @@ def replay(env: RobotTask, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarr
     model = copy.copy(env.physics.model)
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-8
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    for body, (x, y, yaw) in zip(env.physics.placed, np.asarray(env.placed_poses(start), np.float64), strict=True):
-        model.body_pos[body, :2] = x, y
-        model.body_quat[body] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+    scene.place(model, env.placed, np.asarray(env.placed_poses(start), np.float64))
     data.qpos[:] = start.qpos
     places, over = [np.array(data.qpos)], [False]
     for action in np.asarray(trajectory.actions[: int(trajectory.length)], np.float64):
@@ -255,17 +253,38 @@ def test_images_come_back_from_a_trajectory(played) -> None:
     assert (np.asarray(env.show(jax.tree.map(lambda x: jnp.asarray(x[0, end - 1]), episodes.states)).reward) == 0).all()
 
 
+@pytest.mark.parametrize(("task", "begin", "end"), [
+    (BlockPulling, (0.42, 0.05), (0.6, 0.05)), (BlockPushing, (0.5, -0.03), (0.5, 0.15)),
+    (DrawerOpening, (0.5, 0.05), (0.3, 0.05))])
+def test_strokes(task: type[RobotTask], begin: tuple[float, float], end: tuple[float, float]) -> None:
+    """The object is at (0.5, 0.05), the other one 10 cm along x from it, the pad 13.5 cm along y."""
+    stroke = task().stroke(jnp.array([0.5, 0.05, 0.0]), jnp.array([0.6, 0.05, 0.0]), jnp.array([0.5, 0.185]))
+    np.testing.assert_allclose([stroke.begin, stroke.end], [begin, end], atol=1e-6)
+    way = np.subtract(end, begin)
+    np.testing.assert_allclose(stroke.forth, way / np.linalg.norm(way), atol=1e-6)
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
+def test_an_expert_knows_its_task_by_any_name(domain: str) -> None:
+    env = make(domain)
+    named = type("Mine", (type(env),), {"name": "mine"})()
+    env_state, _ = env.reset(jax.random.key(0))
+    action, other = (expert.act(expert.start_with(jnp.int32(0), env_state), env_state)[0]
+                     for expert in (Planner(env), Planner(named)))
+    np.testing.assert_array_equal(action, other)
+
+
 def test_changing_over() -> None:
     """An expert whose object stands still works on the other one, after retreating for two steps."""
     env = DrawerOpening()
     state = env.reset(jax.random.key(1))[0]
     for changes_over in (True, False):
         expert = Planner(env, changes_over)
-        patience = PLANS[env.name].patience
+        patience = env.plan.patience
         memory = dataclasses.replace(expert.start_with(jnp.int32(1), state), stage=jnp.int32(2))
         hook = env.object_poses(state)[1]
         still = dataclasses.replace(state, qpos=state.qpos.at[:4].set(jnp.concatenate([hook[:2], jnp.array([
-            PLANS[env.name].work]), hook[2:] + np.pi / 2])))
+            env.plan.work]), hook[2:] + np.pi / 2])))
         actions, chosen = [], []
         for _ in range(patience + 3):
             action, memory = expert.act(memory, still)

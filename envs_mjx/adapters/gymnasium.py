@@ -73,9 +73,11 @@ class AsGymnasium(gymnasium.Env):
         return key
 
 
-def _space(spec: ArraySpec) -> spaces.Box:
+def _space(spec: ArraySpec) -> spaces.Box | spaces.MultiBinary:
     """All that an array of this shape and type can hold."""
     dtype = np.dtype(spec.dtype)
+    if dtype.kind == "b":
+        return spaces.MultiBinary(spec.shape)
     if np.issubdtype(dtype, np.integer):
         return spaces.Box(np.iinfo(dtype).min, np.iinfo(dtype).max, spec.shape, dtype.type)
     return spaces.Box(-np.inf, np.inf, spec.shape, dtype.type)

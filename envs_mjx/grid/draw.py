@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from envs_mjx.base import Environment
+from envs_mjx.errors import UserError
 from envs_mjx.grid.world import GridState, GridWorld
 
 _CELL = 32  # pixels
@@ -22,7 +23,7 @@ _COLOURS = {
 _AGENT, _GRID, _INK, _PAPER = (32, 32, 40), (206, 206, 206), (20, 20, 20), (255, 255, 255)
 
 
-class NoDrawing(TypeError):
+class NoDrawing(UserError):
     """This environment cannot be drawn."""
 
 

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from envs_mjx.robot import scene, window
-from envs_mjx.robot.blocks import Block, BlockTask, square_gap
+from envs_mjx.robot.blocks import Block, BlockTask, behind, square_gap
+from envs_mjx.robot.plan import Plan, Stroke
 from envs_mjx.robot.task import RobotState
 
 _TOUCHING = 0.001
@@ -20,7 +21,8 @@ class BlockPulling(BlockTask):
     """
 
     name = "block_pulling"
-    opening = window.OPEN
+    opening, has_pad = window.TASKS[name]
+    plan = Plan(hover=0.1, work=0.03, patience=3, retreat=(0.0, 0.0, 1.0, 0.0))
     expert_noise = 0.2
     block = Block(side=0.10, height=0.05, mass=0.5, friction=0.5)
     reach = 0.0
@@ -38,3 +40,9 @@ class BlockPulling(BlockTask):
         """() bool: whether the blocks touch."""
         fixed = env_state.poses[1 - env_state.movable]
         return square_gap(env_state.qpos[4:], fixed, self.block.side / 2) <= _TOUCHING
+
+    def stroke(self, own: jax.Array, other: jax.Array, goal: jax.Array) -> Stroke:
+        """From behind the block to the other one."""
+        del goal
+        begin, forth = behind(own, other[:2])
+        return Stroke(begin, other[:2], forth)

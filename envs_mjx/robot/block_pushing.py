@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from envs_mjx.robot import depth, scene, window
-from envs_mjx.robot.blocks import Block, BlockTask
+from envs_mjx.robot.blocks import Block, BlockTask, behind
+from envs_mjx.robot.plan import Plan, Stroke
 from envs_mjx.robot.task import RobotState, first_valid
 from envs_mjx.robot.window import PAD_DEPTH, PAD_SIDE
 
@@ -12,6 +13,7 @@ _ON_PAD = 0.05
 _CUBES, _PADS = 0.14, 0.135  # half-widths of the areas of their middles
 _APART, _FROM_PAD = 0.12, 0.09
 _DETOUR = 0.1
+_SHORT_OF_PAD = 0.035
 _CANDIDATES = 64
 """A candidate is valid with probability 0.22 (measured): all of 64 fail once in 7e6 resets."""
 
@@ -26,7 +28,8 @@ class BlockPushing(BlockTask):
     """
 
     name = "block_pushing"
-    opening = window.HALF_OPEN
+    opening, has_pad = window.TASKS[name]
+    plan = Plan(hover=0.11, work=0.03, patience=2, retreat=(0.0, 0.0, 0.0, 0.0))
     block = Block(side=0.05, height=0.05, mass=0.02, friction=1.0)
     reach = 0.05
     blocks_collide = True
@@ -48,6 +51,12 @@ class BlockPushing(BlockTask):
     def solved(self, env_state: RobotState) -> jax.Array:
         """() bool: whether the loose cube is on the pad."""
         return jnp.linalg.norm(env_state.qpos[4:6] - env_state.goal) < _ON_PAD
+
+    def stroke(self, own: jax.Array, other: jax.Array, goal: jax.Array) -> Stroke:
+        """From behind the cube to a little before the pad's middle."""
+        del other
+        begin, forth = behind(own, goal)
+        return Stroke(begin, goal - _SHORT_OF_PAD * forth, forth)
 
     def ground(self, env_state: RobotState) -> jax.Array:
         """(84, 84): the table at 0, the pad 2 cm deeper so that it can be seen."""

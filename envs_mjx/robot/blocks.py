@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.robot import depth, scene
-from envs_mjx.robot.task import RobotState, RobotTask, turn_common, turn_poses, turn_vectors
+from envs_mjx.robot.rotation import turn_poses, turn_vectors
+from envs_mjx.robot.task import RobotState, RobotTask, turn_common
+
+_BEHIND = 0.08
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +93,16 @@ class BlockTask(RobotTask):
         """(84, 84) height of the ground. Default: the table, at 0."""
         del env_state
         return jnp.zeros((depth.SIZE, depth.SIZE), jnp.float32)
+
+
+def behind(block: jax.Array, towards: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(2,) 8 cm from the middle of a block at pose (3,), on its far side from `towards` (2,); (2,) the direction there.
+
+    That is where the gripper goes down to bring the block there.
+    """
+    way = towards - block[:2]
+    forth = way / jnp.maximum(jnp.linalg.norm(way), 1e-6)
+    return block[:2] - _BEHIND * forth, forth
 
 
 def square_gap(first: jax.Array, second: jax.Array, half: float) -> jax.Array:

@@ -32,7 +32,6 @@ _PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int":
               "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
               "float32": "f4", "float64": "f8"}
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_FARTHEST = 0.31  # m, of an observation: black in the picture
 
 
 class CameraFileError(ValueError):
@@ -170,7 +169,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
                                      description="The observation of one moment from recorded files.")
     parser.add_argument("files", nargs="+", type=pathlib.Path, help="depth images (.png, .npz) and clouds (.ply)")
     parser.add_argument("--calibration", required=True, type=pathlib.Path, help="the cameras, as JSON")
-    parser.add_argument("--domain", required=True, choices=window.OPENINGS, help="tells how far the gripper is open")
+    parser.add_argument("--domain", required=True, choices=window.TASKS, help="tells how far the gripper is open")
     parser.add_argument("--gripper", required=True, nargs=4, type=float, metavar=("X", "Y", "Z", "YAW"),
                         help="pose of the end effector in the robot's frame, metres and radians")
     parser.add_argument("--pad", nargs=2, type=float, metavar=("X", "Y"), help="middle of the goal pad, metres")
@@ -182,8 +181,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
     options = parse(arguments)
     try:
-        if (options.pad is not None) != (options.domain == "block_pushing"):
-            raise CameraFileError("--pad: accepted with --domain block_pushing, and needed there")
+        if (options.pad is not None) != window.TASKS[options.domain].has_pad:
+            padded = " or ".join(name for name, outfit in window.TASKS.items() if outfit.has_pad)
+            raise CameraFileError(f"--pad: accepted with --domain {padded}, and needed there")
         calibration = read_calibration(options.calibration)
         seen = fuse(*(read_cloud(path, calibration) for path in options.files))
     except CameraFileError as error:
@@ -191,10 +191,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     pad = None if options.pad is None else np.array(options.pad, np.float32)
     gripper = np.array(options.gripper, np.float32)
-    observation = observe(seen, gripper, window.OPENINGS[options.domain], pad)
+    observation = observe(seen, gripper, window.TASKS[options.domain].opening, pad)
     np.savez_compressed(options.out.with_suffix(".npz"), observation=observation)
-    grey = np.round(255 * (1 - np.clip(observation[..., 0] / _FARTHEST, 0, 1))).astype(np.uint8)
-    Image.fromarray(grey).save(options.out.with_suffix(".png"))
+    Image.fromarray(window.grey(observation[..., 0])).save(options.out.with_suffix(".png"))
     print(f"{int(seen.measured.sum())} points of {len(options.files)} files: {options.out.with_suffix('.npz')}")
     return 0
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from envs_mjx.robot import depth, scene, window
+from envs_mjx.robot.plan import Plan, Stroke
 from envs_mjx.robot.task import RobotState, RobotTask, first_valid, turn_common
 
 CABINET = (0.1065, 0.114, 0.054)  # depth, width, height
@@ -14,7 +15,9 @@ HOOK_INSIDE_BAR = 0.03
 """From the bar's axis to where the gripper hooks it, towards the front."""
 _FRONT = CABINET[0] / 2
 _OPEN = 0.05
-_MAX_TRAVEL = 0.10
+MAX_TRAVEL = 0.10
+"""How far a drawer can be open."""
+_PULL = 0.2
 _HANDLE_FRICTION = 0.8
 _NEAR, _FAR, _SIDEWAYS, _BETWEEN = 0.15, 0.20, 0.1, 0.12
 _CANDIDATES = 12
@@ -32,7 +35,8 @@ class DrawerOpening(RobotTask):
     """
 
     name = "drawer_opening"
-    opening = window.CLOSED
+    opening, has_pad = window.TASKS[name]
+    plan = Plan(hover=0.11, work=0.01, patience=3, retreat=(0.0, 0.0, 1.0, 0.0))
     expert_noise = 0.2
     placed = ("loose", "fixed")
 
@@ -40,7 +44,7 @@ class DrawerOpening(RobotTask):
         """Gripper and both cabinets; what only is seen: the open tray in place of the solid one that fingers meet."""
         bodies, pairs = "", []
         for name in self.placed:
-            joint = (f'<joint type="slide" axis="-1 0 0" range="0 {_MAX_TRAVEL}" frictionloss="1" damping="2"/>'
+            joint = (f'<joint type="slide" axis="-1 0 0" range="0 {MAX_TRAVEL}" frictionloss="1" damping="2"/>'
                      if name == "loose" else "")
             bodies += f"""
               <body name="{name}">
@@ -88,6 +92,12 @@ class DrawerOpening(RobotTask):
     def solved(self, env_state: RobotState) -> jax.Array:
         """() bool: whether the loose drawer is open."""
         return env_state.qpos[4] > _OPEN
+
+    def stroke(self, own: jax.Array, other: jax.Array, goal: jax.Array) -> Stroke:
+        """From the handle away from the cabinet."""
+        del other, goal
+        forth = -jnp.stack([jnp.cos(own[2]), jnp.sin(own[2])])
+        return Stroke(own[:2], own[:2] + _PULL * forth, forth)
 
     def turn(self, env_state: RobotState, angle: jax.Array) -> RobotState:
         """Turned by `angle` (): the drawer's travel turns with its cabinet."""

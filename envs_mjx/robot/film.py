@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from envs_mjx.robot import window
 from envs_mjx.robot.headless import BACKENDS
 from envs_mjx.robot.task import OUTCOMES, RobotState, RobotTask
 
 SIDE = 252  # pixels of a panel, three for each pixel of an image
 _CAPTION, _GAP = 22, 4  # pixels
-_FARTHEST = 0.31  # metres: the largest depth there is
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)
 
 _RENDER = """
@@ -24,10 +24,10 @@ import pickle, sys
 import numpy as np
 from envs_mjx import registry
 from envs_mjx.robot.view import View
-name, size, path = sys.argv[1:]
+task, size, path = sys.argv[1:]
 with open(path, "rb") as file:
     states = pickle.load(file)
-view = View(registry.make(name), int(size))
+view = View(registry.make(task), int(size))
 np.save(path + ".npy", np.stack([view.picture(state) for state in states]))
 view.close()
 """
@@ -59,12 +59,13 @@ def rendered(env: RobotTask, states: Sequence[RobotState], size: int = SIDE) -> 
     the process.
     """
     named = os.environ.get("MUJOCO_GL")
+    task = f"{type(env).__module__}:{type(env).__qualname__}"  # that it has a registered name is not certain
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "states"
         path.write_bytes(pickle.dumps(list(states)))
         for backend in (named,) if named else BACKENDS:
             run = subprocess.run(
-                [sys.executable, "-c", _RENDER, env.name, str(size), str(path)], capture_output=True, check=False,
+                [sys.executable, "-c", _RENDER, task, str(size), str(path)], capture_output=True, check=False,
                 env={**os.environ, "MUJOCO_GL": backend})
             if run.returncode == 0:
                 return np.load(f"{path}.npy")
@@ -73,9 +74,8 @@ def rendered(env: RobotTask, states: Sequence[RobotState], size: int = SIDE) -> 
 
 def grey(depth: np.ndarray) -> np.ndarray:
     """(SIDE, SIDE, 3) uint8 of (84, 84) metres: near is bright."""
-    grey = np.round(255 * (1 - np.clip(depth / _FARTHEST, 0, 1))).astype(np.uint8)
     factor = SIDE // depth.shape[0]
-    return np.repeat(np.repeat(grey, factor, axis=0), factor, axis=1)[..., None].repeat(3, axis=2)
+    return np.repeat(np.repeat(window.grey(depth), factor, axis=0), factor, axis=1)[..., None].repeat(3, axis=2)
 
 
 def side_by_side(panels: dict[str, np.ndarray], caption: str) -> np.ndarray:

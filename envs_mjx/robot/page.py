@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from envs_mjx.robot import scene
+from envs_mjx.robot import scene, window
 from envs_mjx.robot.task import RobotState, RobotTask
 
 MODULES = {
@@ -81,14 +81,13 @@ def system(env: RobotTask, states: Sequence[RobotState]) -> dict[str, Any]:
             "pos": model.geom_pos[geom].tolist(), "rot": model.geom_quat[geom].tolist(),
             "size": model.geom_size[geom].tolist()})
     geoms["world"] = [_fixed("Plane", [0.0, 0.0, 0.0], [1.0, 1.0, 0.1], [0.8, 0.8, 0.8, 1.0])]
-    if np.any(states[0].goal):
-        geoms["world"].append(_fixed("Box", [*map(float, states[0].goal), 0.0], [0.045, 0.045, 0.0005], _YELLOW))
+    if env.has_pad:
+        half = window.PAD_SIDE / 2
+        geoms["world"].append(_fixed("Box", [*map(float, states[0].goal), 0.0], [half, half, 0.0005], _YELLOW))
     moments = []
     for env_state in states:
         data.qpos[:] = np.asarray(env_state.qpos, np.float64)
-        for body, (x, y, yaw) in zip(env.physics.placed, np.asarray(env.placed_poses(env_state)), strict=True):
-            model.body_pos[body, :2] = x, y
-            model.body_quat[body] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+        scene.place(model, env.placed, np.asarray(env.placed_poses(env_state)))
         mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
         moments.append({"pos": data.xpos[1:].tolist(), "rot": data.xquat[1:].tolist()})
     return {"opt": {"timestep": _STEP_SECONDS}, "geoms": geoms, "states": {"x": moments}}

@@ -5,8 +5,6 @@ pushes. When the object does not move for a while, it changes over to the other 
 object is movable. Lengths in metres, angles in radians.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -18,34 +16,9 @@ _STAGES = 3
 _WORK = _STAGES - 1
 _MOVED = 0.003
 """An object that moves less in one step of work counts as standing still: contacts give way a little."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """How one task is worked on."""
-
-    hover: float
-    """Height from which the gripper goes down."""
-    work: float
-    """Height at which it pulls or pushes."""
-    patience: int
-    """Steps of work without motion before it changes over."""
-    retreat: tuple[float, float, float, float]
-    """The action of the two steps that change over."""
-
-
-PLANS = {
-    "block_pulling": Plan(hover=0.1, work=0.03, patience=3, retreat=(0.0, 0.0, 1.0, 0.0)),
-    "block_pushing": Plan(hover=0.11, work=0.03, patience=2, retreat=(0.0, 0.0, 0.0, 0.0)),
-    "drawer_opening": Plan(hover=0.11, work=0.01, patience=3, retreat=(0.0, 0.0, 1.0, 0.0)),
-}
 _BATCH = 16
 """Episodes side by side: the fastest on a CPU."""
 _RETREAT_STEPS = 2
-_BEHIND = 0.08
-"""From the middle of a block to where the gripper goes down."""
-_SHORT_OF_PAD = 0.035
-_PULL = 0.2
 
 
 @struct.dataclass
@@ -71,7 +44,7 @@ class Trajectory:
 
     @property
     def success(self) -> jax.Array:
-        """() bool"""
+        """() bool: whether the episode ended with the task solved."""
         return self.outcome == SUCCESS
 
 
@@ -88,7 +61,6 @@ class Planner:
                 sees what comes of it and makes it good; what is recorded is what was done.
         """
         self.env = env
-        self.plan = PLANS[env.name]
         self.changes_over = changes_over
         self.noise = noise
 
@@ -106,7 +78,7 @@ class Planner:
         objects = self.env.object_poses(env_state)
         moved = jnp.linalg.norm(objects[planner.chosen, :2] - planner.seen[planner.chosen]) > _MOVED
         stuck = jnp.where((planner.stage == _WORK) & ~moved, planner.stuck, 0)
-        change = (stuck >= self.plan.patience) & self.changes_over
+        change = (stuck >= self.env.plan.patience) & self.changes_over
         chosen = jnp.where(change, 1 - planner.chosen, planner.chosen)
         stage = jnp.where(change, 0, planner.stage)
         retreating = jnp.where(change, _RETREAT_STEPS, planner.retreating)
@@ -115,7 +87,7 @@ class Planner:
         error = error.at[3].set(_wrap_half_turn(error[3]))
         steps = error / scene.ACTION_SCALE
         arrives = (jnp.abs(steps) < 1).all() & (retreating == 0)
-        action = jnp.where(retreating > 0, jnp.array(self.plan.retreat, jnp.float32), jnp.clip(steps, -1.0, 1.0))
+        action = jnp.where(retreating > 0, jnp.array(self.env.plan.retreat, jnp.float32), jnp.clip(steps, -1.0, 1.0))
         return action, PlannerState(
             chosen=chosen,
             stage=jnp.where(arrives, (stage + 1) % _STAGES, stage),
@@ -126,18 +98,9 @@ class Planner:
 
     def _waypoints(self, objects: jax.Array, chosen: jax.Array, goal: jax.Array) -> jax.Array:
         """(3, 4) x, y, z, yaw of the three stages."""
-        own, other = objects[chosen], objects[1 - chosen]
-        if self.env.name == "drawer_opening":
-            forth = -jnp.stack([jnp.cos(own[2]), jnp.sin(own[2])])
-            begin, end = own[:2], own[:2] + _PULL * forth
-        elif self.env.name == "block_pulling":
-            forth = _direction(other[:2] - own[:2])
-            begin, end = own[:2] - _BEHIND * forth, other[:2]
-        else:
-            forth = _direction(goal - own[:2])
-            begin, end = own[:2] - _BEHIND * forth, goal - _SHORT_OF_PAD * forth
+        plan, (begin, end, forth) = self.env.plan, self.env.stroke(objects[chosen], objects[1 - chosen], goal)
         yaw = jnp.arctan2(forth[1], forth[0]) + jnp.pi / 2
-        heights = jnp.array([self.plan.hover, self.plan.work, self.plan.work], jnp.float32)
+        heights = jnp.array([plan.hover, plan.work, plan.work], jnp.float32)
         places = jnp.clip(jnp.stack([begin, begin, end]), scene.WORKSPACE_LOW[None, :2], scene.WORKSPACE_HIGH[None, :2])
         return jnp.concatenate([places, heights[:, None], jnp.broadcast_to(yaw, (_STAGES, 1))], axis=1)
 
@@ -182,10 +145,6 @@ def demonstrations(env: RobotTask, key: jax.Array, number: int = 80, spare: floa
     episodes = jax.lax.map(Planner(env, noise=env.expert_noise).play, keys, batch_size=_BATCH)
     order = jnp.argsort(~episodes.success, stable=True)[:number]
     return jax.tree.map(lambda x: x[order], episodes)
-
-
-def _direction(vector: jax.Array) -> jax.Array:
-    return vector / jnp.maximum(jnp.linalg.norm(vector), 1e-6)
 
 
 def _wrap_half_turn(angle: jax.Array) -> jax.Array:

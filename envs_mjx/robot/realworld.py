@@ -5,10 +5,12 @@ The scenes are drawn as in training. Everything else differs: MuJoCo C with grav
 off in place and time and that measure badly (`envs_mjx.robot.gap` says how much), a movable object and frictions that
 are not those of training, and a safety controller: pressing onto an object is a protective stop and ends the episode.
 
-It is an `Environment` for evaluation. `reset` and `step` are pure functions here as well, so that an episode can be
-repeated exactly, also with the other object movable. What is lost on a host:
+It is an `Environment` for evaluation. What `reset` and `step` give depends on their arguments and on the gap that the
+world was made with alone, so that an episode can be repeated exactly, also with the other object movable. What is lost
+on a host:
 
-* they cannot be compiled, mapped or scanned: one episode at a time, arrays of NumPy, about ten steps a second;
+* they cannot be compiled, mapped or scanned, nor called by two threads at once, since each call writes all that it
+  needs into the one model that MuJoCo holds: one episode at a time, arrays of NumPy, about ten steps a second;
 * `TimeStep.state` is zeros: what is privileged in training is not there outside of it.
 """
 
@@ -22,11 +24,10 @@ import numpy as np
 
 from envs_mjx.base import Environment, TimeStep
 from envs_mjx.robot import cameras as fusion
-from envs_mjx.robot import sensors, tabletop
+from envs_mjx.robot import scene, sensors, tabletop
 from envs_mjx.robot.cameras import Cameras
 from envs_mjx.robot.film import SIDE
 from envs_mjx.robot.gap import Gap
-from envs_mjx.robot.scene import target_of
 from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotState, RobotTask
 
 NOTHING_TOUCHED, IMMOVABLE, MOVABLE = -1, 0, 1
@@ -93,9 +94,8 @@ class RealWorld(Environment):
         self._movable = np.unique(self.model.geom_bodyid[self._loose])
         self._draw_scene = jax.jit(lambda key: training.reset(key)[0])
         self._conditions = jax.jit(lambda moment: (training.solved(moment), training.left_workspace(moment)))
-        pad = training.name == "block_pushing"
         self._observe = jax.jit(lambda cameras, images, gripper, goal: fusion.observe(
-            fusion.cloud(cameras, images), gripper, training.opening, goal if pad else None))
+            fusion.cloud(cameras, images), gripper, training.opening, goal if training.has_pad else None))
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
@@ -142,7 +142,7 @@ class RealWorld(Environment):
         self._resume(env_state)
         start = self.data.qpos[:4].copy()
         wanted = np.nan_to_num(np.asarray(action, np.float32))
-        target = np.asarray(target_of(jnp.asarray(start, jnp.float32), jnp.asarray(wanted)))
+        target = np.asarray(scene.target_of(jnp.asarray(start, jnp.float32), jnp.asarray(wanted)))
         robot, seen, outcome = env_state.robot, None, RUNNING
         pressed, touched = env_state.pressed, env_state.first_touched
         for tick in range(1, _TICKS + 1):
@@ -212,11 +212,8 @@ class RealWorld(Environment):
     def _furnish(self, robot: RobotState, draw: Draw) -> None:
         """Make the model that of an episode: where things stand that do not move, and the draw."""
         model, nominal = self.model, self._nominal
-        for name, (x, y, yaw) in zip(self.training.placed, np.asarray(self.training.placed_poses(robot)), strict=True):
-            body = model.body(name).id
-            model.body_pos[body, :2] = x, y
-            model.body_quat[body] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
-        if self.training.name == "block_pushing":
+        scene.place(model, self.training.placed, np.asarray(self.training.placed_poses(robot)))
+        if self.training.has_pad:
             model.body_pos[model.body("pad").id] = *robot.goal, 0
         model.body_mass[self._movable] = nominal.body_mass[self._movable] * draw.mass
         model.body_inertia[self._movable] = nominal.body_inertia[self._movable] * draw.mass

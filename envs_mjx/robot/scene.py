@@ -6,6 +6,7 @@ in radians; a pose (3,) is x, y, yaw.
 """
 
 import contextlib
+import dataclasses
 import io
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs_mjx.robot.window import FINGER_BELOW, FINGER_RADIUS
+from envs_mjx.robot.window import FINGER_BELOW, FINGER_RADIUS, HIGHEST
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional package warp is missing
     from mujoco import mjx
@@ -23,7 +24,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional p
 CENTRE = np.array([0.5, 0.0], np.float32)
 """x and y of the middle of the workspace."""
 WORKSPACE_LOW = np.array([0.3, -0.2, 0.01], np.float32)
-WORKSPACE_HIGH = np.array([0.7, 0.2, 0.25], np.float32)
+WORKSPACE_HIGH = np.array([0.7, 0.2, HIGHEST], np.float32)
 START = np.array([0.5, 0.0, 0.2, 0.0], np.float32)
 """x, y, z, yaw of the gripper after a reset."""
 ACTION_SCALE = np.array([0.05, 0.05, 0.05, np.pi / 8], np.float32)
@@ -37,9 +38,38 @@ RAMP_SUBSTEPS = 6
 """The set-point moves evenly over these substeps; the others let the gripper arrive (a test allows 2.5 mm)."""
 _HEIGHT = 2
 """Of the gripper, among positions and forces."""
-_STIFFNESS, _FORCE = 2500.0, 30.0  # N/m on 1 kg, critically damped; N
-_TURN_STIFFNESS, _TORQUE = 12.5, 3.0  # Nm/rad on 0.005 kg m^2, critically damped; Nm
+_INERTIA = 0.005  # kg m^2, of the gripper, whose mass is 1 kg
 _CONTACT = 'solref="0.04 1"'  # the shortest time constant that this time step allows
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive:
+    """What moves the gripper along one axis, critically damped."""
+
+    stiffness: float
+    """N/m, or Nm/rad."""
+    limit: float
+    """Newtons, or Nm."""
+
+
+SLIDE, TURN = Drive(2500.0, 30.0), Drive(12.5, 3.0)
+
+
+def joints_xml(height: Drive = SLIDE) -> str:
+    """The gripper's mass and its joints x, y, z, yaw; `height` is what drives z."""
+    joints = "".join(
+        f'<joint name="gripper_{name}" type="{kind}" axis="{axis}" damping="{2 * (drive.stiffness * inertia) ** 0.5}"/>'
+        for name, kind, axis, drive, inertia in (
+            ("x", "slide", "1 0 0", SLIDE, 1.0), ("y", "slide", "0 1 0", SLIDE, 1.0),
+            ("z", "slide", "0 0 1", height, 1.0), ("yaw", "hinge", "0 0 1", TURN, _INERTIA)))
+    return f'<inertial pos="0 0 0" mass="1" diaginertia="{_INERTIA} {_INERTIA} {_INERTIA}"/>{joints}'
+
+
+def drives_xml(height: Drive = SLIDE) -> str:
+    """What moves those joints."""
+    return "".join(
+        f'<position joint="gripper_{name}" kp="{drive.stiffness}" forcerange="{-drive.limit} {drive.limit}"/>'
+        for name, drive in (("x", SLIDE), ("y", SLIDE), ("z", height), ("yaw", TURN)))
 
 
 def gripper_xml(offset: float, capsules: bool) -> str:
@@ -55,16 +85,7 @@ def gripper_xml(offset: float, capsules: bool) -> str:
         if capsules:
             geoms.append(f'<geom name="finger{index}" type="capsule" size="{FINGER_RADIUS}" '
                          f'fromto="{x} 0 {tip} {x} 0 {tip + 0.05}"/>')
-    damping, turn_damping = 2 * _STIFFNESS**0.5, 2 * (_TURN_STIFFNESS * 0.005) ** 0.5
-    return f"""
-      <body name="gripper">
-        <inertial pos="0 0 0" mass="1" diaginertia="0.005 0.005 0.005"/>
-        <joint name="gripper_x" type="slide" axis="1 0 0" damping="{damping}"/>
-        <joint name="gripper_y" type="slide" axis="0 1 0" damping="{damping}"/>
-        <joint name="gripper_z" type="slide" axis="0 0 1" damping="{damping}"/>
-        <joint name="gripper_yaw" type="hinge" axis="0 0 1" damping="{turn_damping}"/>
-        {"".join(geoms)}
-      </body>"""
+    return f'<body name="gripper">{joints_xml()}{"".join(geoms)}</body>'
 
 
 def pair_xml(first: str, second: str, friction: float | None) -> str:
@@ -79,10 +100,6 @@ def scene_xml(gripper: str, bodies: str, pairs: Sequence[str]) -> str:
     The solver's tolerance is what float32 can tell: with MuJoCo's own, 1e-8, it always iterates to the end.
     One or two iterations are not enough: objects get pushed into each other.
     """
-    drives = "".join(
-        f'<position joint="gripper_{name}" kp="{stiffness}" forcerange="{-limit} {limit}"/>'
-        for name, stiffness, limit in (("x", _STIFFNESS, _FORCE), ("y", _STIFFNESS, _FORCE), ("z", _STIFFNESS, _FORCE),
-                                       ("yaw", _TURN_STIFFNESS, _TORQUE)))
     return f"""
     <mujoco>
       <compiler angle="radian" autolimits="true"/>
@@ -93,7 +110,7 @@ def scene_xml(gripper: str, bodies: str, pairs: Sequence[str]) -> str:
       <default><geom contype="0" conaffinity="0"/><joint solreffriction="0.04 1" solreflimit="0.04 1"/></default>
       <worldbody>{gripper}{bodies}</worldbody>
       <contact>{"".join(pairs)}</contact>
-      <actuator>{drives}</actuator>
+      <actuator>{drives_xml()}</actuator>
     </mujoco>"""
 
 
@@ -107,6 +124,14 @@ def loose_joints_xml(mass: float, side: float, friction: float) -> str:
     return (f'<joint type="slide" axis="1 0 0" frictionloss="{force}"/>'
             f'<joint type="slide" axis="0 1 0" frictionloss="{force}"/>'
             f'<joint type="hinge" axis="0 0 1" frictionloss="{0.3826 * side * force}" armature="2e-5" damping="1e-4"/>')
+
+
+def place(model: Any, names: Sequence[str], poses: np.ndarray) -> None:
+    """Let bodies of a model of MuJoCo C stand at `poses` (len(names), 3); their heights stay."""
+    for name, (x, y, yaw) in zip(names, poses, strict=True):
+        body = model.body(name).id
+        model.body_pos[body, :2] = x, y
+        model.body_quat[body] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
 
 class Physics:

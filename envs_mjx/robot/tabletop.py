@@ -22,11 +22,9 @@ TIME_STEP = 0.002
 GRIPPER_GROUP = 2
 """Of geoms, so that it can be left out of an image."""
 FINGER_LENGTH = 0.10
-_STIFFNESS, _FORCE = 2500.0, 30.0
-"""Sideways as compliant as in training, or the immovable object would be torn off."""
-_STIFFNESS_DOWN, _FORCE_DOWN = 10000.0, 150.0
-"""An arm's weight is behind what it presses on: stiff enough to trip a safety controller within millimetres."""
-_TURN_STIFFNESS, _TORQUE = 12.5, 3.0
+_DOWN = scene.Drive(stiffness=10000.0, limit=150.0)
+"""An arm's weight is behind what it presses on: stiff enough to trip a safety controller within millimetres. Sideways
+it is as compliant as in training, or the immovable object would be torn off."""
 
 # Who meets whom: fingers (1) everything; a free block (2) the table and the fixed block; drawers fingers alone.
 _FINGER, _LOOSE, _STATIC = 'contype="1" conaffinity="0"', 'contype="2" conaffinity="1"', 'contype="0" conaffinity="3"'
@@ -39,8 +37,10 @@ def build(task: RobotTask) -> mujoco.MjModel:  # pyright: ignore[reportAttribute
     """The model of a task's scene. Position (qpos) 0 to 3 are the gripper's; the movable object's follow."""
     if isinstance(task, BlockTask):
         bodies, table = _blocks_xml(task.block), task.block.friction
-    else:
+    elif isinstance(task, drawer.DrawerOpening):
         bodies, table = _cabinet_xml("loose", _RED) + _cabinet_xml("fixed", _BLUE), 0.5
+    else:
+        raise TypeError(f"the other world has blocks and drawers, and no scene for {type(task).__name__}")
     pad = f"""
       <body name="pad" pos="0 0 -1">
         <geom name="pad" type="box" size="{window.PAD_SIDE / 2} {window.PAD_SIDE / 2} 0.0002" {_SEEN}
@@ -61,7 +61,7 @@ def build(task: RobotTask) -> mujoco.MjModel:  # pyright: ignore[reportAttribute
               rgba="0.8 0.8 0.8 1"/>
         {pad}{_gripper_xml(task.opening)}{bodies}{_cameras_xml()}
       </worldbody>
-      <actuator>{_drives_xml()}</actuator>
+      <actuator>{scene.drives_xml(_DOWN)}</actuator>
     </mujoco>"""
     return mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -72,25 +72,12 @@ def _gripper_xml(opening: window.Opening) -> str:
         f'<geom name="finger{index}" type="capsule" size="{radius}" friction="{scene.FINGER_FRICTION} 0.005 0.0001" '
         f'fromto="{x} 0 {tip} {x} 0 {tip + FINGER_LENGTH}" {_FINGER} {_GREY}/>'
         for index, x in enumerate((-opening.finger, opening.finger)))
-    joints = "".join(
-        f'<joint name="gripper_{name}" type="{kind}" axis="{axis}" damping="{2 * (stiffness * inertia) ** 0.5}"/>'
-        for name, kind, axis, stiffness, inertia in (
-            ("x", "slide", "1 0 0", _STIFFNESS, 1.0), ("y", "slide", "0 1 0", _STIFFNESS, 1.0),
-            ("z", "slide", "0 0 1", _STIFFNESS_DOWN, 1.0), ("yaw", "hinge", "0 0 1", _TURN_STIFFNESS, 0.005)))
     palm = tip + FINGER_LENGTH + 0.02
     return f"""
-      <body name="gripper" gravcomp="1">
-        <inertial pos="0 0 0" mass="1" diaginertia="0.005 0.005 0.005"/>{joints}{fingers}
+      <body name="gripper" gravcomp="1">{scene.joints_xml(_DOWN)}{fingers}
         <geom name="palm" type="box" size="0.07 0.03 0.02" pos="0 0 {palm}" {_SEEN} {_GREY}/>
         <geom name="wrist" type="cylinder" size="0.035" fromto="0 0 {palm} 0 0 {palm + 0.3}" {_SEEN} {_GREY}/>
       </body>"""
-
-
-def _drives_xml() -> str:
-    return "".join(
-        f'<position joint="gripper_{name}" kp="{stiffness}" forcerange="{-limit} {limit}"/>'
-        for name, stiffness, limit in (("x", _STIFFNESS, _FORCE), ("y", _STIFFNESS, _FORCE),
-                                       ("z", _STIFFNESS_DOWN, _FORCE_DOWN), ("yaw", _TURN_STIFFNESS, _TORQUE)))
 
 
 def _blocks_xml(block: Block) -> str:
@@ -106,7 +93,8 @@ def _cabinet_xml(name: str, colour: str) -> str:
     """A cabinet, a drawer in it that slides when it is the `loose` one, and its handle."""
     depth, width, height = drawer.CABINET
     joint = ("" if name == "fixed" else
-             '<joint name="drawer" type="slide" axis="-1 0 0" range="0 0.1" frictionloss="1" damping="2"/>')
+             f'<joint name="drawer" type="slide" axis="-1 0 0" range="0 {drawer.MAX_TRAVEL}" frictionloss="1" '
+             'damping="2"/>')
     half, wall, top, floor = drawer.TRAY / 2, drawer.TRAY_WALL / 2, drawer.TRAY_TOP / 2, drawer.TRAY_FLOOR / 2
     boxes = [(0.0, 0.0, half, half, floor)]
     boxes += [(sign * (half - wall), 0.0, wall, half, top) for sign in (-1, 1)]

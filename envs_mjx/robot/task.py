@@ -22,6 +22,8 @@ from envs_mjx.base import (
     Variable,
 )
 from envs_mjx.robot import depth, noise, rotation, scene, window
+from envs_mjx.robot.plan import Plan, Stroke
+from envs_mjx.robot.rotation import turn_places, turn_poses, turn_vectors
 
 OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limit", "protective stop")
 """What `RobotState.outcome` counts."""
@@ -30,9 +32,6 @@ RUNNING, SUCCESS, LEFT, NOT_FINITE, TIME_LIMIT, STOPPED = range(6)
 CONTRAST = 0.05
 """Metres: the height of an object, against depths that shift by four times as much when the gripper rises. The fingers,
 painted 0, still tell how high it is."""
-DEEPEST = float(scene.WORKSPACE_HIGH[2]) + depth.CAMERA_ABOVE_GRIPPER
-"""Metres: the depth of the table at the gripper's highest. A policy is to see no more than that, give or take three
-times the paper's noise."""
 
 
 @struct.dataclass
@@ -68,7 +67,7 @@ class RobotTask(Environment):
         observation="channel 0: depth below a camera 6 cm above the gripper, 0 where a finger is; channel 1: zeros. "
                     "The window is 0.4 m x 0.4 m, the gripper where pixels 41 and 42 meet",
         observation_unit="m",
-        observation_range=(-3 * noise.AMPLITUDE, DEEPEST + 3 * noise.AMPLITUDE),
+        observation_range=(-3 * noise.AMPLITUDE, window.DEEPEST + 3 * noise.AMPLITUDE),
         action="the gripper's next set-point, relative to where it is",
         action_scale=tuple(scene.ACTION_SCALE.tolist()),
         action_units=("m", "m", "m", "rad"),
@@ -76,6 +75,10 @@ class RobotTask(Environment):
         rate=1 / (scene.TIME_STEP * scene.SUBSTEPS),
     )
     opening: window.Opening
+    has_pad = False
+    """Whether there is a goal pad, at `RobotState.goal`."""
+    plan: Plan
+    """How the scripted expert works; `stroke` says where."""
     expert_noise = 0.0
     """Standard deviation of what is added to the actions of demonstrations, in fractions of the largest action."""
     variables = (Variable("movable", hidden=True, num_values=2),
@@ -119,7 +122,7 @@ class RobotTask(Environment):
 
     @abc.abstractmethod
     def placed_poses(self, env_state: RobotState) -> jax.Array:
-        """(len(placed), 3)"""
+        """(len(placed), 3) x, y in metres and yaw in radians of `placed`, in the world's frame: all episode long."""
 
     @abc.abstractmethod
     def object_poses(self, env_state: RobotState) -> jax.Array:
@@ -127,7 +130,21 @@ class RobotTask(Environment):
 
     @abc.abstractmethod
     def solved(self, env_state: RobotState) -> jax.Array:
-        """() bool"""
+        """() bool: whether the task is done, which ends an episode with reward 1.
+
+        Asked after every substep of the physics, with no more than `qpos` brought up to date: metres and radians in the
+        world's frame, of a drawer how far it is open.
+        """
+
+    @abc.abstractmethod
+    def stroke(self, own: jax.Array, other: jax.Array, goal: jax.Array) -> Stroke:
+        """How the expert works on an object.
+
+        Args:
+            own: (3,) its pose, of `object_poses`.
+            other: (3,) the other object's.
+            goal: (2,) of the state.
+        """
 
     @abc.abstractmethod
     def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -236,23 +253,6 @@ def turn_common(env_state: RobotState, angle: jax.Array) -> RobotState:
     qvel = env_state.qvel.at[:2].set(turn_vectors(env_state.qvel[:2], angle))
     return dataclasses.replace(env_state, qpos=qpos, qvel=qvel, poses=turn_poses(env_state.poses, angle),
                                goal=turn_places(env_state.goal, angle))
-
-
-def turn_poses(poses: jax.Array, angle: jax.Array) -> jax.Array:
-    """(..., 3) x, y, yaw turned by `angle` () about the middle of the workspace."""
-    return jnp.concatenate([turn_places(poses[..., :2], angle), poses[..., 2:] + angle], axis=-1)
-
-
-def turn_places(places: jax.Array, angle: jax.Array) -> jax.Array:
-    """(..., 2) x, y turned by `angle` () about the middle of the workspace."""
-    centre = jnp.broadcast_to(jnp.asarray(scene.CENTRE), places.shape)
-    return turn_vectors(places - centre, angle) + centre
-
-
-def turn_vectors(vectors: jax.Array, angle: jax.Array) -> jax.Array:
-    """(..., 2) x, y turned by `angle` ()."""
-    cos, sin, x, y = jnp.cos(angle), jnp.sin(angle), vectors[..., 0], vectors[..., 1]
-    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _noise_key(key: jax.Array) -> jax.Array:

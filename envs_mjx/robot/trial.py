@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs_mjx.registry import sample_action
 from envs_mjx.robot.planner import Planner
 from envs_mjx.robot.task import OUTCOMES, RUNNING, SUCCESS, RobotState, RobotTask
 
@@ -37,7 +36,7 @@ class Trial:
 
     @property
     def success(self) -> np.ndarray:
-        """(N,) bool"""
+        """(N,) bool: whether an episode ended with the task solved."""
         return self.outcome == SUCCESS
 
     def counts(self) -> dict[str, int]:
@@ -137,7 +136,7 @@ def _play_random(env: RobotTask, keys: jax.Array) -> tuple:
         def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
             env_state, not_finite = carry
             key_action, key_step = jax.random.split(key)
-            action = sample_action(env, key_action)
+            action = env.action_spec.sample(key_action)
             later, shown = env.step(key_step, env_state, action)
             over = env_state.outcome != RUNNING
             env_state = jax.tree.map(lambda old, new: jnp.where(over, old, new), env_state, later)

@@ -6,7 +6,7 @@ The renderer needs OpenGL without a display: set MUJOCO_GL=egl or osmesa before 
 import mujoco
 import numpy as np
 
-from envs_mjx.robot import depth, scene
+from envs_mjx.robot import depth, scene, window
 from envs_mjx.robot.task import RobotState, RobotTask
 
 _TOP = "top"
@@ -20,8 +20,9 @@ class View:
         self._env = env
         camera = (f'<camera name="{_TOP}" projection="orthographic" fovy="{depth.WINDOW}" '
                   'pos="0 0 0.5" xyaxes="0 1 0 -1 0 0"/><light pos="0.5 0 1.5" castshadow="false"/>')
-        pad = ('<body name="pad"><geom name="pad" type="box" size="0.045 0.045 0.0005" rgba="0.9 0.8 0.2 1"/></body>'
-               if env.name == "block_pushing" else "")
+        half = window.PAD_SIDE / 2
+        pad = (f'<body name="pad"><geom name="pad" type="box" size="{half} {half} 0.0005" rgba="0.9 0.8 0.2 1"/></body>'
+               if env.has_pad else "")
         table = '<geom name="table" type="plane" size="2 2 0.1" rgba="0.8 0.8 0.8 1"/>'
         visual = (f'<visual><global offwidth="{size}" offheight="{size}"/><quality offsamples="0" shadowsize="0"/>'
                   '<map znear="0.001" zfar="5"/></visual><statistic extent="1" center="0.5 0 0"/>')
@@ -62,11 +63,8 @@ class View:
 
     def _place(self, env_state: RobotState) -> None:
         self.data.qpos[:] = np.asarray(env_state.qpos, np.float64)
-        for name, (x, y, yaw) in zip(self._env.placed, np.asarray(self._env.placed_poses(env_state)), strict=True):
-            body = self.model.body(name).id
-            self.model.body_pos[body, :2] = x, y
-            self.model.body_quat[body] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
-        if self._env.name == "block_pushing":
+        scene.place(self.model, self._env.placed, np.asarray(self._env.placed_poses(env_state)))
+        if self._env.has_pad:
             self.model.body_pos[self.model.body("pad").id, :2] = env_state.goal
         self.model.cam_pos[self.model.camera(_TOP).id, :2] = env_state.qpos[:2]
         mujoco.mj_forward(self.model, self.data)  # pyright: ignore[reportAttributeAccessIssue]

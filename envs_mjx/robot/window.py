@@ -6,7 +6,7 @@ where pixels 41 and 42 meet. This module needs NumPy only, and its functions tak
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,11 @@ SIZE = 84
 WINDOW = 0.4
 PIXEL = WINDOW / SIZE
 CAMERA_ABOVE_GRIPPER = 0.06
+HIGHEST = 0.25
+"""Of the gripper in its workspace, above the table."""
+DEEPEST = HIGHEST + CAMERA_ABOVE_GRIPPER
+"""The depth of the table at the gripper's highest. A policy is to see no more than that, give or take three times the
+paper's noise."""
 NOTHING = -1.0
 """Height of what is not there: below everything that is."""
 PAD_SIDE, PAD_DEPTH = 0.09, 0.02
@@ -43,7 +48,18 @@ OPEN = Opening(0.052, 29.0)
 HALF_OPEN = Opening(0.036, 14.0)
 CLOSED = Opening(0.015, 0.0)
 """Narrower than the original's, whose bar of 80 mm would sit on a handle's side bars, which leave 60 mm."""
-OPENINGS = {"block_pulling": OPEN, "block_pushing": HALF_OPEN, "drawer_opening": CLOSED}
+
+
+class Outfit(NamedTuple):
+    """What a task's images show beside its objects."""
+
+    opening: Opening
+    has_pad: bool
+    """Whether there is a goal pad."""
+
+
+TASKS = {"block_pulling": Outfit(OPEN, has_pad=False), "block_pushing": Outfit(HALF_OPEN, has_pad=True),
+         "drawer_opening": Outfit(CLOSED, has_pad=False)}
 
 
 def namespace(*arrays: Array) -> Any:
@@ -70,3 +86,8 @@ def depth(height: Array, gripper_z: Array, painted: Array) -> Array:
     """(84, 84) metres below a camera 6 cm above the gripper, at least 0; 0 where a finger is `painted` (84, 84)."""
     xp = namespace(height, gripper_z)
     return xp.where(painted, 0.0, xp.maximum(gripper_z + CAMERA_ABOVE_GRIPPER - height, 0.0))
+
+
+def grey(depth: np.ndarray) -> np.ndarray:
+    """Metres as uint8 of the same shape, for people: near is bright, `DEEPEST` black."""
+    return np.round(255 * (1 - np.clip(depth / DEEPEST, 0, 1))).astype(np.uint8)

@@ -11,8 +11,8 @@ import numpy as np
 from mijax.agents.core import Agent
 from mijax.agents.dqn import DQN
 from mijax.deploy.numpy_policy import Policy, Refused
-from mijax.metrics import RunError
 from mijax.rollout import select, start_episodes
+from mijax.run_folder import RunError
 from mijax.types import Params
 
 TOLERANCE = 1e-4

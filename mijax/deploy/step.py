@@ -13,8 +13,8 @@ from mijax.agents.core import Agent
 from mijax.agents.dqn import DQN
 from mijax.agents.variants import memory_of
 from mijax.deploy.numpy_policy import NEXT, VERSION
-from mijax.metrics import RunError
 from mijax.nets.two_branch import MemoryState
+from mijax.run_folder import RunError
 from mijax.types import Params
 
 Shapes = dict[str, jax.ShapeDtypeStruct]

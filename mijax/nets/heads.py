@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mijax.frames import Frames, Patches, apply_layer
+from mijax.frames import Frames, Layers, Patches, apply_layer
 from mijax.nets.encoders import STRIDED_IMAGE_MINIMUM, Convolution, image_plan
 
 
@@ -36,7 +36,14 @@ class ObservationEmbedder(nn.Module):
 
     features: int
     dtype: jnp.dtype = jnp.float32
-    layers = ((2, 1), (2, 1))  # of images that are not large; not used on vectors
+
+    @staticmethod
+    def layers_on(shape: Sequence[int]) -> Layers:
+        """What can work on patches of observations of this shape: nothing of vectors and large images."""
+        if len(shape) != 3 or min(shape[:2]) >= STRIDED_IMAGE_MINIMUM:
+            return ()
+        kernel = 2 if min(shape[:2]) > 2 else 1
+        return ((kernel, 1), (kernel, 1))
 
     @nn.compact
     def __call__(self, observation: Frames) -> jax.Array:
@@ -45,8 +52,9 @@ class ObservationEmbedder(nn.Module):
             for block in image_plan(min(x.shape[1:3])):
                 x = nn.relu(Convolution(block.channels, block.kernel, block.stride)(x.astype(self.dtype)))
         elif isinstance(x, Patches) or x.ndim == 4:
-            for channels, (kernel, stride) in zip((8, 16), self.layers, strict=True):
-                convolution = Convolution(channels, kernel, stride)
+            kernel = x.windows[0].shape[-1] if isinstance(x, Patches) else self.layers_on(x.shape[1:])[0][0]
+            for channels in (8, 16):
+                convolution = Convolution(channels, kernel, 1)
                 x = apply_layer(lambda y, conv=convolution: nn.relu(conv(y.astype(self.dtype))), x)
         assert isinstance(x, jax.Array)
         return nn.relu(nn.Dense(self.features, dtype=self.dtype)(x.reshape(x.shape[0], -1).astype(self.dtype)))

@@ -38,7 +38,9 @@ def frame_features(encoder: ObservationEmbedder | Encoder, tokens: Tokens) -> ja
     if not isinstance(tokens.frames, FrameTable):
         return encoder(tokens.frames)
     index = cast(jax.Array, tokens.frame).reshape(-1)
-    every, count = tokens.frames.prepared(encoder.layers), len(tokens.frames)
+    shape, count = tokens.frames.frames.shape[1:], len(tokens.frames)
+    layers = encoder.layers_on(shape) if isinstance(encoder, ObservationEmbedder) else encoder.layers
+    every = tokens.frames.prepared(layers)
     if count < LONG_LIST:
         return encoder(every)[index]
     few, present, place = keep_present(index, count, count // 4)

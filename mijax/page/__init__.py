@@ -5,10 +5,10 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mijax.metrics import RunError
 from mijax.page.episodes import Episodes
 from mijax.page.numbers import curve_data, option_data
 from mijax.results import AGENT_COLOURS, SOLVED, ReportedRun
+from mijax.run_folder import RunError
 from mijax.tables import run_table, seed_table
 
 FILE = "report.html"

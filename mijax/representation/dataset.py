@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.base import ActionSpec, DiscreteActions, Environment, EnvState, TimeStep
+from envs_mjx.base import Environment, EnvState, TimeStep
 from mijax.config import DataSource
 from mijax.demonstrations import demonstrate
 
@@ -57,13 +57,6 @@ class Episodes:
     length: jax.Array  # (E,) int32  steps of each episode
 
 
-def random_action(spec: ActionSpec, key: jax.Array) -> jax.Array:
-    """An action drawn uniformly: () int32, or (size,) float32 in [-1, 1]."""
-    if isinstance(spec, DiscreteActions):
-        return jax.random.randint(key, (), 0, spec.num, jnp.int32)
-    return jax.random.uniform(key, (spec.size,), jnp.float32, -1.0, 1.0)
-
-
 @functools.partial(jax.jit, static_argnums=(0, 2))
 def random_episodes(env: Environment, key: jax.Array, num_episodes: int) -> Episodes:
     """`num_episodes` whole episodes of the uniform random policy, side by side."""
@@ -78,7 +71,7 @@ def random_episodes(env: Environment, key: jax.Array, num_episodes: int) -> Epis
         def step(carry, step_key):
             env_state, alive = carry
             action_key, env_key = jax.random.split(step_key)
-            action = random_action(env.action_spec, action_key)
+            action = env.action_spec.sample(action_key)
             env_state, timestep = env.step(env_key, env_state, action)
             arrived = (action, timestep.reward, timestep.terminated)
             return (env_state, alive & ~timestep.done), (arrived, frame(env_state, timestep), alive)

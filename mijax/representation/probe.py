@@ -105,14 +105,19 @@ class ProbeReport:
         return max((d.informed for d in self.decodings if not d.hidden and d.source == "z_s"), default=0.0)
 
     @property
+    def tested(self) -> bool:
+        """Whether the environment declares variables, so that there is something to decode."""
+        return bool(self.decodings)
+
+    @property
     def p1(self) -> bool:
         """z_s and z_o together hold everything."""
-        return not self.p1_failures
+        return self.tested and not self.p1_failures
 
     @property
     def p2(self) -> bool:
         """They hold different things."""
-        return not self.p2_failures
+        return self.tested and not self.p2_failures
 
     def as_dict(self) -> dict[str, Any]:
         """For probe.json."""
@@ -171,9 +176,11 @@ def _decodings(
             ("both", both, everywhere, hidden + seen))
     truth, episode = np.asarray(data.ground_truth, np.float64), np.asarray(data.episode)
     result = []
+    fitted = episode % 2 == 0
     for number, (source, z, rows, wanted) in enumerate(jobs):
-        if wanted:
-            result += _decode(source, z[rows], truth[rows], episode[rows] % 2 == 0, [variables[i] for i in wanted],
+        enough = (rows & fitted).any() and (rows & ~fitted).any()  # not where every observation shows what is hidden
+        if wanted and enough:
+            result += _decode(source, z[rows], truth[rows], fitted[rows], [variables[i] for i in wanted],
                               wanted, None if key is None else jax.random.fold_in(key, number))
     return tuple(sorted(result, key=lambda d: ([v.name for v in variables].index(d.variable), d.source)))
 
@@ -324,9 +331,6 @@ def _verdicts(
     decodings: tuple[Decoding, ...], errors: dict[str, float]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Reasons why P1 and P2 fail."""
-    if not decodings:
-        nothing = ("the environment declares no variables to decode",)
-        return nothing, nothing
     p1 = [f"{d.variable} is not decoded from both ({d.measure} {d.best:.2f} < {DECODED})"
           for d in decodings if d.source == "both" and not d.is_present]
     if errors.get("reward_r2", 1.0) < REWARD_DECODED:
@@ -356,6 +360,8 @@ def format_report(report: ProbeReport) -> str:
         lines.append("  held out      " + ", ".join(f"{name} {value:.4g}" for name, value in report.errors.items()))
     lines.append("  z_s           " + ", ".join(f"{name} {value:.4g}" for name, value in report.geometry.items()))
     lines.append("  bonus/episode " + ", ".join(f"{name} {value:.3g}" for name, value in report.bonus.items()))
+    if not report.tested:
+        return "\n".join([*lines, "  P1 and P2 not tested: the environment declares no variables to decode"])
     for name, failures in (("P1", report.p1_failures), ("P2", report.p2_failures)):
         lines.append(f"  {name} {'fail: ' + '; '.join(failures) if failures else 'pass'}")
     return "\n".join(lines)

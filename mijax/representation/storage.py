@@ -9,6 +9,8 @@ import numpy as np
 from flax import serialization
 
 from envs_mjx.base import Environment
+from envs_mjx.errors import UserError
+from mijax.files import write_atomically
 from mijax.representation.model import init_parameters, networks_for
 from mijax.types import Representation
 
@@ -18,7 +20,7 @@ FORMAT = 1
 """Raised whenever folders of an earlier version cannot be read any more."""
 
 
-class RepresentationError(ValueError):
+class RepresentationError(UserError):
     """A folder holds no representation for this environment; the message names the folder and the reason."""
 
 
@@ -36,16 +38,6 @@ def save_representation(representation: Representation, env: Environment, folder
     }
     write_atomically(folder / PARAMETERS_FILE, serialization.to_bytes(jax.device_get(representation)))
     write_atomically(folder / FACTS_FILE, json.dumps(facts, indent=2).encode())
-
-
-def write_atomically(path: pathlib.Path, content: bytes) -> None:
-    """Replace a file in one step: after a crash it is either the old one or the new one."""
-    aside = path.with_name(path.name + ".part")
-    with aside.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
 
 
 def load_representation(path: str | os.PathLike[str], env: Environment) -> Representation:

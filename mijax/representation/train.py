@@ -17,6 +17,7 @@ import optax
 from flax import struct
 
 from envs_mjx.base import Environment
+from envs_mjx.errors import UserError
 from mijax.config import Stage1Config
 from mijax.frames import Frames, Patches, keep_present
 from mijax.losses.belief import kl_standard_normal
@@ -38,7 +39,7 @@ ProgressCallback = Callable[[int, dict[str, float]], None]
 """Called after each epoch with its number, from 1, and the metrics of its last batch."""
 
 
-class DivergenceError(RuntimeError):
+class DivergenceError(UserError):
     """A loss became infinite or not a number; the message names it."""
 
 

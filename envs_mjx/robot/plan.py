@@ -1,0 +1,28 @@
+"""What a task tells its scripted expert (paper Appendix C.1); `envs_mjx.robot.planner` is the expert."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How one task is worked on. Lengths in metres."""
+
+    hover: float
+    """Height from which the gripper goes down."""
+    work: float
+    """Height at which it pulls or pushes."""
+    patience: int
+    """Steps of work without motion before it changes over."""
+    retreat: tuple[float, float, float, float]
+    """The action of the two steps that change over."""
+
+
+class Stroke(NamedTuple):
+    """One pull or push, seen from above, in metres."""
+
+    begin: jax.Array  # (2,) x, y where the gripper goes down
+    end: jax.Array  # (2,) x, y where it goes from there
+    forth: jax.Array  # (2,) of length 1, the way of the object: the fingers are put across it

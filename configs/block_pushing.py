@@ -1,6 +1,8 @@
 """Block-Pushing (paper Appendix B.4): see `configs.robots`.
 
     python -m mijax.train --domain block_pushing
+
+Not solved: 0.47 after 12 600 steps, one seed (results/robots). Ninety minutes of one core.
 """
 
 from configs.robots import robot

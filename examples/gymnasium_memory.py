@@ -1,6 +1,6 @@
 """A T-maze written for Gymnasium, stepped on the host: the side of the reward is shown once, at the start.
 
-    pip install 'mijax[adapters]'
+    pip install -e '.[adapters]'
     python -m mijax.train --domain examples.gymnasium_memory:Maze --steps 20000
 """
 

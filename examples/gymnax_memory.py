@@ -1,6 +1,6 @@
 """bsuite's memory chain as gymnax has it: a bit is shown once, and asked for five steps later.
 
-    pip install 'mijax[adapters]'
+    pip install -e '.[adapters]'
     python -m mijax.train --domain examples.gymnax_memory:MemoryChain --steps 30000
 """
 

@@ -1,6 +1,6 @@
-"""The robot tasks' part of the bench: `python -m launch.robots DOMAIN` measures one task in a process of its own.
+"""The robot tasks' part of the bench: measures one task in a process of its own, which `launch.bench` starts.
 
-`launch.bench` starts it twice over an empty compilation cache: what the second process compiles comes from the disk. A
+It does so twice over an empty compilation cache: what the second process compiles comes from the disk. A
 process of its own can also have one host device per core, over which the environments are spread.
 """
 
@@ -127,7 +127,9 @@ def measure_apart(domain: str, steps: int, repetitions: int) -> tuple[Measuremen
 
 
 def main() -> None:
-    """Print a `Measurement` as JSON."""
+    """Print a `Measurement` as JSON, for `measure_apart`: DOMAIN STEPS REPETITIONS."""
+    if len(sys.argv) != 4:
+        sys.exit("started by: python -m launch.bench --only environments --domains block_pulling")
     domain, steps, repetitions = sys.argv[1:]
     runtime.prepare(host_devices=runtime.cores())
     env = registry.make(domain)

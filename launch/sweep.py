@@ -286,7 +286,7 @@ class OnRay:
             import ray  # pyright: ignore[reportMissingImports]
             import ray.exceptions  # pyright: ignore[reportMissingImports]
         except ImportError:
-            raise ConfigError("--backend: got 'ray', which is not installed (pip install 'mijax[sweep]'), accepted: "
+            raise ConfigError("--backend: got 'ray', which is not installed (pip install -e '.[sweep]'), accepted: "
                               "local") from None
         self._ray = ray
         if not ray.is_initialized():

@@ -132,6 +132,9 @@ class NetworkConfig:
     """Type of the arithmetic; parameters stay float32."""
 
     def __post_init__(self) -> None:
+        for name in ("critic_hidden", "actor_hidden", "auxiliary_hidden"):
+            widths = getattr(self, name)
+            require(all(width >= 1 for width in widths), f"network.{name.replace('_', '-')}", widths, "numbers >= 1")
         _require_at_least("network.", self, 1, "layers", "heads", "gru_width", "action_embedding",
                           "observation_embedding")
         require(0 <= self.dropout <= 0.9, "network.dropout", self.dropout, "a number in [0, 0.9]")

@@ -22,7 +22,7 @@ from envs_mjx.grid.optimal import optimum
 from mijax import evaluate_robot, runtime
 from mijax.agents.forgetful import Forgetful
 from mijax.agents.variants import memory_of
-from mijax.config import require
+from mijax.config import ConfigError, require
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.rollout import Actor
 from mijax.run_folder import RunFolder
@@ -96,10 +96,10 @@ def evaluate_seed(
 ) -> dict[str, float]:
     """Means over greedy episodes, the discounted return in fractions of the best possible where that is known, and of a
     robot task the success by what was touched first."""
+    if evaluate_robot.is_robot(learner.env):
+        return evaluate_robot.evaluate_policy(learner.env, actor, state.agent.target, key, episodes)
     program = jax.jit(functools.partial(learner.evaluate, actor=actor), static_argnums=2)
     results = {name: float(np.mean(values)) for name, values in program(state, key, episodes).items()}
-    if evaluate_robot.is_robot(learner.env):
-        results |= evaluate_robot.halves(learner.env, actor, state.agent.target, key, episodes)
     best = optimum(learner.domain, learner.config.evaluation.discount)
     if best is not None:
         results["of_optimum"] = results["discounted_return"] / best.discounted_return
@@ -136,7 +136,8 @@ def check(options: EvaluateOptions) -> None:
     require(options.remember >= 0, "remember", options.remember, "a number >= 1, or 0 for all")
     require(not (options.planner and options.random), "random", True, "--planner or --random, not both")
     if not (options.planner or options.random):
-        require(options.run is not None, "run", None, "a run folder, or --planner or --random with --domain")
+        if options.run is None:
+            raise ConfigError("got no run folder, accepted: one, or --planner or --random with --domain")
         for name, given in (("domain", options.domain), ("html", options.html or None), ("out", options.out)):
             require(given is None, name, str(given), "with --planner only; a run has its own domain and folder")
         return

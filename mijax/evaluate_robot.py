@@ -101,16 +101,22 @@ def evaluate_random(domain: str, episodes: int, say: Callable[[str], None]) -> "
     return played
 
 
-def halves(env: "RobotTask", actor: Actor, params: Params, key: jax.Array, episodes: int) -> dict[str, float]:
-    """Success of greedy episodes by which object was touched first, the movable or the immovable one; left out where
-    that never happened."""
+def evaluate_policy(
+    env: "RobotTask", actor: Actor, params: Params, key: jax.Array, episodes: int
+) -> dict[str, float]:
+    """Means over greedy episodes; and success by which object was touched first, the movable or the immovable one, left
+    out where that never happened."""
     from envs_mjx.robot import trial
 
     played = trial.policy_trial(
         env, functools.partial(actor.act, params), actor.initial_memory, actor.no_action, key, episodes)
     assert played.movable_first is not None
+    discounts = actor.config.evaluation.discount ** (played.length - 1.0)
+    results = {"success": played.success, "return": played.success, "discounted_return": played.success * discounts,
+               "length": played.length, "reveals": played.touched}
     rows = zip(HALVES, (played.touched & played.movable_first, played.touched & ~played.movable_first), strict=True)
-    return {name: float(played.success[which].mean()) for name, which in rows if which.any()}
+    results |= {name: played.success[which] for name, which in rows if which.any()}
+    return {name: float(np.mean(values)) for name, values in results.items()}
 
 
 def _endings(played: "Trial") -> str:

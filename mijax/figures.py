@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mijax import statistics
+from mijax.representation.probe import DECODED, LEAK_R2, REWARD_DECODED
 from mijax.representation.search import SearchResult
 from mijax.results import ReportedRun
 
@@ -234,9 +235,9 @@ def draw_trade_off(result: SearchResult, path: pathlib.Path, title: str) -> None
                         axis.plot(x, y, **RING)
                 shares.annotate(f"{number}", (leaked, reward), fontsize=6.5, textcoords="offset points", xytext=(5, 4),
                                 color="#666666")
-        decoded.axhline(0.99, **_THRESHOLD)
-        decoded.axvline(0.05, **_THRESHOLD)
-        shares.axhline(0.9, **_THRESHOLD)
+        decoded.axhline(DECODED, **_THRESHOLD)
+        decoded.axvline(LEAK_R2, **_THRESHOLD)
+        shares.axhline(REWARD_DECODED, **_THRESHOLD)
         decoded.set(xlim=(-0.05, 1.08), ylim=(-0.05, 1.08), xlabel="leak: what can be seen anyway, decoded from $z_s$",
                     ylabel="what is hidden, decoded from $z_s$")
         shares.set(xscale="log", xlabel="share of the variance of $z_s$ that is not the hidden's (from 1e-9)",

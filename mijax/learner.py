@@ -95,7 +95,8 @@ class Learner:
             episodes.timestep, episodes.previous_action, episodes.env_state, episodes.symmetry)
 
     def _demonstrate(self, replay: Replay, representation: Representation | None, key: jax.Array) -> Replay:
-        """The replay with the successful episodes of an expert, some of them twice if it fails at times."""
+        """The replay with the successful episodes of an expert, some of them twice if it fails at times; if it always
+        fails, with episodes of length 0 (see `has_demonstrations`)."""
         key_episodes, key_symmetry = jax.random.split(key)
         shown = self.env.demonstrations(key_episodes, self.demonstrations)
         assert shown is not None
@@ -112,7 +113,12 @@ class Learner:
         order = jnp.argsort(~shown.success, stable=True)
         order = order[jnp.arange(self.demonstrations) % jnp.maximum(jnp.sum(shown.success), 1)]
         records, length = jax.tree.map(lambda x: x[order], (records, shown.length))
-        return fill(replay, records, length + 1)
+        return fill(replay, records, jnp.where(jnp.any(shown.success), length + 1, 0))
+
+    def has_demonstrations(self, state: LearnerState) -> bool:
+        """Whether those that a fresh state should have in its replay are there."""
+        kept = state.replay.length[self.config.num_envs :][: self.demonstrations]
+        return bool(jnp.all(kept > 0))
 
     def _believe(self, state: LearnerState, key: jax.Array) -> AgentState:
         """Fit Believer's history VAE to as many random episodes as stage 1 has (paper Appendix A.5, Stage 2)."""

@@ -80,6 +80,15 @@ class RunFolder:
             raise RunError(f"{path}: not a run folder of mijax (config.json names no domain)")
         return run
 
+    def discard(self) -> None:
+        """Remove a run that could not begin; one that has anything of a seed stays."""
+        if self.seeds():
+            return
+        for name in ("config.json", "versions.json"):
+            self._file(name).unlink(missing_ok=True)
+        if not any(self.path.iterdir()):
+            self.path.rmdir()
+
     def config(self) -> dict[str, Any]:
         """The run's options, as written by `create`."""
         return _read_json(self._file("config.json"))

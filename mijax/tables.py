@@ -194,9 +194,9 @@ def comparison_markdown(runs: Sequence[ReportedRun], starts: Mapping[str, int] |
         lines.append(cells)
     return (f"{markdown_table(lines)}\n\nMean ± standard deviation over seeds, interquartile mean (IQM). Area: mean of "
             f"the success curve. Solved: any evaluation with success >= {SOLVED}; steps to solve: those before the "
-            "first one, the median over seeds. Stage 1's random steps count, without success. P: probability that a seed of "
-            "the first line beats one of this line, ties half, with its 95 % bootstrap interval, which says little of "
-            "three seeds.\n")
+            "first one, the median over seeds. Stage 1's random steps count, without success. P: probability that a "
+            "seed of the first line beats one of this line, ties half, with its 95 % bootstrap interval, which says "
+            "little of three seeds.\n")
 
 
 def plain_markdown(table: Table) -> str:

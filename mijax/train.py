@@ -19,6 +19,7 @@ from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.base import ContinuousActions, Environment
 from envs_mjx.contract import check_contract
+from envs_mjx.errors import UserError
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of, unread_groups
@@ -188,7 +189,11 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     clock = CompileClock()
     learnt, stage1_seconds = None, {}
     if needs_representation(config):
-        learnt, stage1_seconds = stage1.representations(run, env, stage1_of(config), seeds, say)
+        try:
+            learnt, stage1_seconds = stage1.representations(run, env, stage1_of(config), seeds, say)
+        except UserError:
+            run.discard()  # options that stage 1 cannot do anything with are no run to go on with
+            raise
     runner = SeedRunner(lambda pack: make_learner(env, config, pack), seeds, config.seeds.strategy)
     checkpoints = checkpoint.open_all(run, seeds, config.checkpoint.keep)
     _start(runner, run, checkpoints, learnt, say)
@@ -218,6 +223,9 @@ def _start(
         run.truncate_after(-1)
         say(f"stage 2: compiling, then {_prelude(runner.learner)}")
         runner.init(learnt)
+        shown = all(runner.learner.has_demonstrations(state) for state in runner.states().values())
+        require(shown, "sac.demonstrations", runner.learner.demonstrations,
+                f"0, as the expert of {runner.learner.env.name} solves none of its episodes")
         runtime.release_memory()
 
 

@@ -23,7 +23,7 @@ from envs_mjx import registry
 from envs_mjx.grid import draw
 from envs_mjx.robot.gap import GAPS
 from mijax import evaluate_robot, runtime
-from mijax.config import require
+from mijax.config import ConfigError, require
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
@@ -96,7 +96,8 @@ def check(options: TransferOptions) -> None:
         require(options.domain is not None, "planner", True, f"with --domain, one of {evaluate_robot.DEMONSTRATED}")
         require(options.seeds is None, "seeds", options.seeds, "with a run only, not with --planner")
     else:
-        require(options.run is not None, "run", None, "a run folder, or --planner with --domain")
+        if options.run is None:
+            raise ConfigError("got no run folder, accepted: one, or --planner with --domain")
         require(options.domain is None, "domain", options.domain, "with --planner only; a run has its own domain")
 
 

@@ -1,5 +1,6 @@
 """Checkpoints of a run are played, tabled and drawn."""
 
+import functools
 import json
 import pathlib
 
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import failure_of
 from PIL import Image
 
 from envs_mjx import registry
@@ -43,13 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return path
 
 
-def failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line that the command says before it fails."""
-    assert evaluate.main(arguments) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert len(captured.err.splitlines()) == 1
-    return captured.err
+failure = functools.partial(failure_of, evaluate.main)
 
 
 def test_the_table_holds_what_the_learner_measures(run: pathlib.Path, capsys: pytest.CaptureFixture[str]):

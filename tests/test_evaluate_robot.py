@@ -1,6 +1,7 @@
 """The robots' experts from the command line: pictures, pages and refusals."""
 
 import dataclasses
+import functools
 import json
 import pathlib
 
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import failure_of
 from PIL import Image
 
 import configs
@@ -27,17 +29,11 @@ def moment(request: pytest.FixtureRequest) -> tuple[RobotTask, RobotState]:
     return env, jax.device_get(env.reset(jax.random.key(0))[0])
 
 
-def failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line that the command says before it fails."""
-    assert evaluate.main(arguments) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert len(captured.err.splitlines()) == 1
-    return captured.err
+failure = functools.partial(failure_of, evaluate.main)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((), "--run: got None, accepted: a run folder, or --planner or --random"),
+    ((), "got no run folder, accepted: one, or --planner or --random"),
     (("--planner",), "--planner: got True, accepted: with --domain, one of block_pulling, block_pushing, drawer"),
     (("--random",), "--random: got True, accepted: with --domain"),
     (("runs/x", "--planner", "--domain", "block_pulling"), "--planner: got 'runs/x', accepted: no run folder"),

@@ -1,6 +1,7 @@
 """Exported policies act as the agents they were made of, in every format, and say what they need."""
 
 import dataclasses
+import functools
 import json
 import pathlib
 import shutil
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import failure_of
 from compass import Compass
 
 from envs_mjx import registry
@@ -279,13 +281,7 @@ def test_a_policy_needs_numpy_and_nothing_else(exported: pathlib.Path, tmp_path:
     assert said.returncode == 0
 
 
-def failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line that the command says before it fails."""
-    assert export.main(arguments) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert len(captured.err.splitlines()) == 1
-    return captured.err
+failure = functools.partial(failure_of, export.main)
 
 
 def test_what_cannot_be_exported_is_named(
@@ -299,7 +295,7 @@ def test_what_cannot_be_exported_is_named(
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.setitem(sys.modules, "flatbuffers", None)
     for kind in ("onnx", "stablehlo"):
-        assert "pip install 'mijax[deploy]'" in failure(capsys, str(run), "--to", kind)
+        assert "pip install -e '.[deploy]'" in failure(capsys, str(run), "--to", kind)
 
 
 def test_a_policy_that_acts_otherwise_is_not_left(

@@ -182,7 +182,7 @@ def test_halves_are_counted_by_what_was_touched_first() -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((), "--run: got None, accepted: a run folder, or --planner with --domain"),
+    ((), "got no run folder, accepted: one, or --planner with --domain"),
     (("runs/x", "--gap", "huge"), "--gap: got 'huge', accepted: none, mild, hard"),
     (("runs/x", "--episodes", "0"), "--episodes: got 0, accepted: a number >= 1"),
     (("--planner",), "--planner: got True, accepted: with --domain, one of block_pulling, block_pushing, drawer"),

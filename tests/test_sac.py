@@ -23,7 +23,7 @@ from tokens import (
     representation,
 )
 
-from envs_mjx.base import TimeStep
+from envs_mjx.base import Demonstrations, TimeStep
 from mijax.agents.core import adam
 from mijax.agents.factory import make_agent
 from mijax.agents.sac import SAC, make_sac
@@ -378,6 +378,29 @@ def test_demonstrations_are_in_the_replay_from_the_start(ours: tuple[Run, Learne
         np.testing.assert_allclose(actions[1:4], 0.8 * np.asarray(moments.cue)[:3], rtol=1e-6)
         assert data.reward[3] == 1
         assert bool(data.terminated[3])
+
+
+class Clumsy(Compass):
+    """Whose expert solves only the last few of its episodes, every other one in a step less."""
+
+    def __init__(self, solved: int):
+        self.solved = solved
+
+    def demonstrations(self, key: jax.Array, number: int) -> Demonstrations:
+        shown, numbers = super().demonstrations(key, number), jnp.arange(number, dtype=jnp.int32)
+        return dataclasses.replace(shown, length=shown.length - numbers % 2, success=numbers >= number - self.solved)
+
+
+@pytest.mark.parametrize(("solved", "lengths"), [(2, [3, 2, 3, 2]), (0, [-1] * 4)])
+def test_an_expert_that_fails(solved: int, lengths: list[int]):
+    """Its successes are kept, again and again; without any there are none."""
+    config = dataclasses.replace(LOOP, agent="base", sac=dataclasses.replace(
+        LOOP.sac, demonstrations=4, rotated_copies=0, pretrain_updates=0, imitation_weight=0.0, trunk="own"))
+    run = Run(config, Clumsy(solved))
+    state = run.start()
+    steps = state.replay.length[config.num_envs :][:4] - 1
+    assert steps.tolist() == lengths
+    assert run.learner.has_demonstrations(state) is (solved > 0)
 
 
 @pytest.mark.lenient

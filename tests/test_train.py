@@ -155,6 +155,8 @@ def test_a_stored_configuration_comes_back() -> None:
     (["--stage1.data", "demonstrations"], "--stage1.data"),
     (["--sac.trunk", "psi"], "--sac.trunk"),
     (["--network.dropout", "0.99"], "--network.dropout"),
+    (["--network.critic-hidden", "0"], "--network.critic-hidden"),
+    (["--stage1.batch-size", "100000", "--stage1.episodes", "2"], "--stage1.batch-size"),
     (["--evaluation.every", "33"], "--evaluation.every"),
     (["--resume", "/nonexistent"], "/nonexistent"),
     (["--domain", "json:dumps"], "json"),

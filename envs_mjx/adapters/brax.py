@@ -2,7 +2,7 @@
 
 `AsBrax("heaven_hell")` shows a policy `obs["state"]` and a critic `obs["privileged_state"]`, the names that brax's PPO
 and MuJoCo Playground use, so that PPO with `policy_obs_key="state"` and `value_obs_key="privileged_state"` is an
-asymmetric actor-critic. brax comes with `pip install 'mijax[robot]'`.
+asymmetric actor-critic. brax comes with `pip install -e '.[robot]'`.
 """
 
 import contextlib

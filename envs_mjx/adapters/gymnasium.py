@@ -25,7 +25,7 @@ from envs_mjx.base import (
 
 
 class AsGymnasium(gymnasium.Env):
-    """One environment, stepped from the host; its compiled functions are shared by all instances of a domain.
+    """One environment, stepped from the host. Each instance compiles its own functions; a second finds them on disk.
 
     `info` holds the privileged `state`, and `success` once an episode has ended. The time limit is reported as
     `truncated`, so no wrapper is needed. For speed step our environments inside `jax.vmap` instead: here every step

@@ -82,7 +82,8 @@ def _draw_cells(draw: ImageDraw.ImageDraw, kinds: list[list[str]]) -> None:
 def _layout(env: Environment, env_state: GridState) -> tuple[GridWorld, list[list[str]]]:
     """The world, and a letter of `_COLOURS` for each of its cells."""
     if not isinstance(env, GridWorld):
-        raise NoDrawing(f"environment {env.name!r} cannot be drawn: only grid worlds (envs_mjx.grid.world) can")
+        raise NoDrawing(f"environment {env.name!r} cannot be drawn, as grid worlds (envs_mjx.grid.world) and robot "
+                        "tasks can; for any other: python -m mijax.report RUN --episode")
     tables, goal = env.tables, int(env_state.goal)
     kinds = np.full(tables.walls.size, ".")
     kinds[tables.walls.reshape(-1)] = "#"

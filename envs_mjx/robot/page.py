@@ -101,7 +101,7 @@ def _viewer() -> dict[str, str]:
     """The scripts of brax's viewer, by name; brax itself is not imported."""
     spec = importlib.util.find_spec("brax")
     if spec is None or not spec.submodule_search_locations:
-        raise ViewerMissing("the HTML viewer is brax's, which is not installed: pip install 'mijax[robot]'")
+        raise ViewerMissing("the HTML viewer is brax's, which is not installed: pip install -e '.[robot]'")
     folder = pathlib.Path(next(iter(spec.submodule_search_locations))) / "visualizer" / "js"
     return {name: _read(folder / f"{name}.js", folder) for name in _VIEWER}
 

@@ -19,7 +19,7 @@ def require(kind: str, *packages: str) -> None:
             importlib.import_module(package)
         except ImportError:
             raise PolicyError(
-                f"{kind}: the package {package} is missing; install it with: pip install 'mijax[deploy]'") from None
+                f"{kind}: the package {package} is missing; install it with: pip install -e '.[deploy]'") from None
 
 
 def load(kind: str, path: pathlib.Path) -> Step:

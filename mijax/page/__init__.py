@@ -70,7 +70,6 @@ def render(data: Mapping[str, Any]) -> str:
 
 
 
-
 def read_data(path: pathlib.Path) -> dict[str, Any]:
     """What `page_data` gave to a page that has been written."""
     start, end = _BLOB.split("/*DATA*/")

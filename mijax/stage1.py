@@ -67,26 +67,25 @@ def reuse(
 
 def representations(
     run: RunFolder, env: Environment, config: Stage1Config, seeds: tuple[int, ...], say: Callable[[str], None]
-) -> tuple[dict[int, Representation], dict[int, float]]:
-    """Every seed's representation, trained where the run has none yet, and the seconds that took."""
-    result, seconds = {}, {}
+) -> dict[int, Representation]:
+    """Every seed's representation, trained where the run has none yet."""
+    result = {}
     for seed in seeds:
-        started = time.perf_counter()
         if not (folder_of(run, seed) / FACTS_FILE).exists():
             learn(run, env, config, seed, say)
         result[seed] = load_representation(folder_of(run, seed), env)
-        seconds[seed] = time.perf_counter() - started
-    return result, seconds
+    return result
 
 
 def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say: Callable[[str], None]) -> ProbeReport:
     """Train one seed's representation, keep it, probe it, keep and say what the probe found."""
-    key, folder = representation_key(seed), folder_of(run, seed)
+    key, folder, started = representation_key(seed), folder_of(run, seed), time.perf_counter()
     with ProgressDisplay(f"stage 1, seed {seed}", config.epochs, unit="epochs") as progress:
         representation, history = learn_representation(env, config, key, on_progress=progress.update)
     report = probe(representation, env, config, jax.random.fold_in(key, 3), history)
     timing = {"updates": history.updates, "updates_per_second": history.updates_per_second,
-              "compile_seconds": history.compile_seconds, "seconds": history.seconds}
+              "compile_seconds": history.compile_seconds, "seconds": history.seconds,
+              "wall_seconds": time.perf_counter() - started}
     _keep(folder, env, representation, report, timing)
     runtime.release_memory()
     say(f"stage 1, seed {seed}: {history.updates} updates in {history.compile_seconds + history.seconds:.0f} s "
@@ -96,8 +95,23 @@ def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say
 
 def passed(run: RunFolder, seed: int) -> bool:
     """Whether a seed's representation passed P1 and P2 when it was made."""
-    report = json.loads((folder_of(run, seed) / PROBE_FILE).read_text())
-    return report["p1"] and report["p2"]
+    report = _probed(run, seed)
+    return bool(report.get("p1") and report.get("p2"))
+
+
+def seconds_of(run: RunFolder, seed: int) -> float:
+    """What stage 1 of a seed took, data and probe included, in whatever run it was; 0 where that is not known."""
+    return float(_probed(run, seed).get("wall_seconds", 0.0))
+
+
+def _probed(run: RunFolder, seed: int) -> dict[str, Any]:
+    """What probe.json holds; nothing where there is none."""
+    path = folder_of(run, seed) / PROBE_FILE
+    try:
+        report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    except ValueError:
+        raise RunError(f"{path}: damaged, not JSON") from None
+    return report if isinstance(report, dict) else {}
 
 
 def choose_weights(

@@ -187,10 +187,10 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
 
     clock = CompileClock()
-    learnt, stage1_seconds = None, {}
+    learnt = None
     if needs_representation(config):
         try:
-            learnt, stage1_seconds = stage1.representations(run, env, stage1_of(config), seeds, say)
+            learnt = stage1.representations(run, env, stage1_of(config), seeds, say)
         except UserError:
             run.discard()  # options that stage 1 cannot do anything with are no run to go on with
             raise
@@ -201,7 +201,7 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     for each in checkpoints.values():
         each.close()
     if finished:
-        _conclude(runner, run, env, stage1_seconds, say)
+        _conclude(runner, run, env, say)
     return run
 
 
@@ -315,16 +315,14 @@ def _overview(rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:
     return {short: float(np.mean(values)) for short, values in columns.items() if values}
 
 
-def _conclude(
-    runner: SeedRunner, run: RunFolder, env: Environment, stage1_seconds: dict[int, float], say: Callable[[str], None]
-) -> None:
+def _conclude(runner: SeedRunner, run: RunFolder, env: Environment, say: Callable[[str], None]) -> None:
     """The last evaluation, summary.json, curve.png and the table."""
     final = runner.evaluate(FINAL_EPISODES)
     best = optimum(env, runner.learner.config.evaluation.discount)
     values = None if best is None else {
         "return": best.undiscounted_return, "discounted_return": best.discounted_return, "success": best.success,
         "length": best.length}
-    wall = {seed: {"stage1": stage1_seconds.get(seed, 0.0)} for seed in runner.seeds}
+    wall = {seed: {"stage1": stage1.seconds_of(run, seed)} for seed in runner.seeds}
     summary = summarise(run, optimum=values, final=final, wall=wall)
     environment = runner.environment_seconds() / len(runner.seeds)
     for result in summary["seeds"].values():

@@ -54,6 +54,7 @@ def test_a_run_leaves_what_it_promises(whole_run: pathlib.Path) -> None:
     for seed in run.seeds():
         result = summary["seeds"][str(seed)]
         assert set(result["wall"]) >= {"compile", "environment", "update", "evaluation", "stage1"}
+        assert result["wall"]["stage1"] > 0
         assert 0 <= result["success"] <= 1
         assert result["length"] <= 50 * (1 + 1e-6)  # a float32 mean
         assert [row["step"] for row in run.metrics(seed)] == [400, 600, 800, 1000, 1200]

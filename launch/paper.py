@@ -26,7 +26,7 @@ from configs.paper import STEPS
 from envs_mjx import registry
 from envs_mjx.base import ContinuousActions
 from launch.experiments import DOMAINS, EXPERIMENTS, Arm
-from mijax import episode, figures, runtime, stage1, tables, train
+from mijax import draw_episode, episode, figures, runtime, stage1, tables, train
 from mijax.agents.variants import needs_representation, stage1_of, unread_groups
 from mijax.config import Config, ConfigError, options_of, parse_seeds, require
 from mijax.learner import make_learner
@@ -249,12 +249,12 @@ def run_intrinsic(name: str, request: Request, domains: Sequence[str]) -> None:
                     informed = np.flatnonzero(seen.first_information() >= 0)
                     index = int(informed[0]) if len(informed) else 0
                     drawn.append((domain, config.information.intrinsic_weight, seen, index))
-                    episode.draw_episode(
+                    draw_episode.draw_episode(
                         seen, index, learner.domain, request.out / f"{name}_{registry.file_name(domain)}.png",
                         weight=config.information.intrinsic_weight,
                         title=f"{figures.display_name(domain)}, seed {seed}, step {step:,}")
         note = note_on(request, list(steps), steps)
-        episode.draw_bonuses([(figures.display_name(d), *rest) for d, *rest in drawn], request.out / f"{name}.png",
+        draw_episode.draw_bonuses([(figures.display_name(d), *rest) for d, *rest in drawn], request.out / f"{name}.png",
                              title=EXPERIMENTS[name].title, note=note)
         tables.write_csv(request.out / f"{name}.csv", lines)
         text = (f"# {EXPERIMENTS[name].title}\n\n{note}\n\n    {command_line(name, request)}\n\n"

@@ -18,13 +18,13 @@ from jax.typing import DTypeLike
 from envs_mjx.base import DiscreteActions, Environment, EnvState, TimeStep
 from mijax.agents.core import Agent, AgentState
 from mijax.agents.factory import make_agent
+from mijax.agents.state_shown import StateShown
 from mijax.agents.variants import variant
 from mijax.augmentation import show_copy, show_tokens, shows_again, take_copies
 from mijax.config import Config
 from mijax.frames import FrameTable
 from mijax.nets.actor_critic import shown
 from mijax.nets.encoders import encoder_for
-from mijax.nets.privileged import StateShown
 from mijax.packing import Layout, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, StepRecord, fill, init_replay, sample_episodes, write
 from mijax.rollout import (

@@ -30,6 +30,7 @@ from envs_mjx.base import DiscreteActions
 from envs_mjx.errors import UserError
 from envs_mjx.grid.world import GridWorld
 from mijax import episode, page, runtime
+from mijax.draw_episode import draw_episode
 from mijax.figures import display_name, draw_curves
 from mijax.learner import Learner, make_learner
 from mijax.page.episodes import Episodes, episode_data
@@ -100,7 +101,7 @@ def report_episode(options: "ReportOptions") -> pathlib.Path:
     learner, seed, step, seen = _trace(run, options.seed, 1)
     path = (options.out or run.path) / f"episode_seed_{seed}.png"
     title = f"{display_name(config.domain)}, {config.agent}, seed {seed}, step {step:,}"
-    episode.draw_episode(seen, 0, learner.domain, path, title=title, weight=config.information.intrinsic_weight)
+    draw_episode(seen, 0, learner.domain, path, title=title, weight=config.information.intrinsic_weight)
     return path
 
 

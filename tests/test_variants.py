@@ -23,9 +23,9 @@ from tokens import (
 
 from envs_mjx.base import ArraySpec
 from mijax.agents.dqn import DQN, make_dqn
+from mijax.agents.state_shown import StateShown
 from mijax.agents.variants import VARIANTS, memory_of, stage1_of, title_of
 from mijax.config import BelieverConfig, Config, ConfigError, DQNConfig, MDPConfig, Stage1Config
-from mijax.nets.privileged import StateShown
 from mijax.types import Tokens
 
 GAMMA = 0.9

@@ -10,9 +10,9 @@ import numpy as np
 
 from envs_mjx.base import ActionSpec, ArraySpec, ContinuousActions, DiscreteActions, Environment
 from mijax.agents.core import Agent, AgentState
+from mijax.agents.state_shown import StateShown
 from mijax.agents.variants import needs_representation
 from mijax.config import Config, NetworkConfig
-from mijax.nets.privileged import StateShown
 from mijax.representation.model import init_parameters, networks_for
 from mijax.types import Representation, Tokens
 

@@ -79,7 +79,7 @@ def main() -> int:
     """The command; returns its exit code."""
     options = tyro.cli(FusionOptions, prog="python -m launch.fusion")
     runtime.prepare()
-    return runtime.exit_code(lambda: compare(options), NoOpenGL)
+    return runtime.exit_code(lambda: compare(options))
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from envs_mjx.errors import UserError
 from launch.job import available_cores
 from mijax import train
 from mijax.config import ConfigError, parse_seeds, require
@@ -383,14 +384,14 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command: 0 when every job is done, 1 when one failed, 130 when it was stopped."""
-    options = parse(sys.argv[1:] if arguments is None else arguments)
     console = Console()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        options = parse(sys.argv[1:] if arguments is None else arguments)
         out = (options.out or pathlib.Path("runs") / options.spec.stem).resolve()
         sweep = read(options.spec, out)
         backend = Local(sweep, options.workers) if options.backend == "local" else OnRay(sweep, options.address)
-    except ConfigError as error:
+    except (UserError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     states = watch(sweep, backend, console)

@@ -16,7 +16,6 @@ from envs_mjx.base import Environment
 from envs_mjx.grid import draw
 from mijax.config import ConfigError
 from mijax.rollout import Actor
-from mijax.run_folder import RunError
 from mijax.types import Params
 
 if TYPE_CHECKING:
@@ -59,10 +58,7 @@ def evaluate_planner(
     env = robot("planner", domain)
     from envs_mjx.robot import page, trial  # MuJoCo is imported with the task only
 
-    try:
-        scripts = None if libraries is None else page.load_scripts(libraries)
-    except page.ViewerMissing as error:
-        raise RunError(str(error)) from None
+    scripts = None if libraries is None else page.load_scripts(libraries)
     started = time.perf_counter()
     played = trial.expert_trial(env, jax.random.key(0), episodes)
     say(f"{domain}: {episodes} episodes of the scripted expert in {time.perf_counter() - started:.0f} s")

@@ -229,7 +229,9 @@ def test_text_clouds(recorded: pathlib.Path) -> None:
     ("left.npz", {"depth": np.zeros((4, 4), np.float32)}, "4 x 4 pixels: expected 240 x 320, as calibrated"),
     ("front.npz", {"depth": np.zeros((4, 4), np.float32)}, "no camera 'front' in the calibration: it has left, right"),
     ("left.png", b"", "no depth image"),
+    ("left.npz", b"PK\x03\x04 torn", "no depth image"),
     ("left.ply", b"ply\n", "not a PLY file"),
+    ("left.ply", b"ply\nformat ascii 1.0\nelement vertex\nend_header\n1", "how many vertices"),
     ("left.ply", b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
                  b"end_header\n1 2 3\n", "torn: expected 2 vertices"),
     ("left.tiff", b"", "accepted are .npz, .png, .ply"),

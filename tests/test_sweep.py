@@ -12,6 +12,7 @@ import threading
 import time
 
 import pytest
+from commands import failure_of
 from rich.console import Console
 
 from launch import sweep
@@ -75,9 +76,8 @@ def test_a_bad_file_is_refused_before_anything_runs(tmp_path: pathlib.Path, text
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--workers", "0"], "workers: got 0"), (["--address", "auto"], "address: got 'auto', accepted: nothing")])
-def test_bad_options(arguments: list[str], message: str):
-    with pytest.raises(ConfigError, match=message):
-        sweep.parse(["spec.yaml", *arguments])
+def test_bad_options(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]):
+    assert message in failure_of(sweep.main, capsys, "spec.yaml", *arguments)
 
 
 class Scripted(Job):

@@ -18,12 +18,14 @@ import dataclasses
 import json
 import pathlib
 import sys
+import zipfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from envs_mjx.errors import UserError
 from envs_mjx.robot import window
 from envs_mjx.robot.cameras import Cameras, Cloud, cloud, fuse, observe
 
@@ -34,7 +36,7 @@ _PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int":
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-class CameraFileError(ValueError):
+class CameraFileError(UserError):
     """A file cannot be used; the message is one line with its name, what is wrong, and what is accepted."""
 
 
@@ -67,8 +69,6 @@ def read_calibration(path: pathlib.Path) -> dict[str, Calibrated]:
                 Cameras(intrinsics, pose[None].astype(np.float32)), int(entry["height"]), int(entry["width"]),
                 float(entry.get("depth_unit", 0.001)))
     except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, CameraFileError):
-            raise
         what = f"no {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
         raise CameraFileError(
             f"{path}: not a calibration ({what}); expected cameras with name, width, height, fx, fy, cx, cy, pose"
@@ -85,12 +85,12 @@ def read_depth(path: pathlib.Path, depth_unit: float = 0.001) -> np.ndarray:
     """
     try:
         if path.suffix == ".npz":
-            with np.load(path) as arrays:
+            with path.open("rb") as file, np.load(file) as arrays:
                 image = arrays["depth"]
         else:
             with Image.open(path) as picture:
                 image = np.asarray(picture)
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise CameraFileError(f"{path}: no depth image ({str(error).splitlines()[0]}); expected a 16-bit .png, or an "
                               ".npz with an array 'depth'") from None
     if image.ndim != 2 or image.dtype == np.uint8 or image.dtype == bool:
@@ -112,7 +112,10 @@ def read_ply(path: pathlib.Path) -> np.ndarray:
     elements = [index for index, line in enumerate(words) if line[:1] == ["element"]]
     if not body or not elements or words[elements[0]][1:2] != ["vertex"] or kind not in ("ascii", *_PLY_ORDERS):
         raise CameraFileError(f"{path}: not a PLY file whose first element is vertex, in ascii or binary")
-    number = int(words[elements[0]][2])
+    number = words[elements[0]][2] if len(words[elements[0]]) > 2 else ""
+    if not number.isdigit():
+        raise CameraFileError(f"{path}: not a PLY file that says how many vertices there are")
+    number = int(number)
     vertex = words[elements[0] : [*elements, len(words)][1]]
     properties = [line[1:] for line in vertex if line[:1] == ["property"]]
     names = [line[-1] for line in properties]

@@ -16,6 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from envs_mjx.errors import UserError
 from envs_mjx.robot import scene, window
 from envs_mjx.robot.task import RobotState, RobotTask
 
@@ -34,7 +35,7 @@ _RED, _BLUE, _GREY, _YELLOW = [0.8, 0.2, 0.2, 1.0], [0.2, 0.4, 0.8, 1.0], [0.3, 
 _STEP_SECONDS = scene.TIME_STEP * scene.SUBSTEPS
 
 
-class ViewerMissing(RuntimeError):
+class ViewerMissing(UserError):
     """A script of the viewer is not installed; the message tells which, and how to get it."""
 
 

@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 
 from envs_mjx.base import Environment, TimeStep
+from envs_mjx.errors import UserError
 from envs_mjx.robot import cameras as fusion
 from envs_mjx.robot import scene, sensors, tabletop
 from envs_mjx.robot.cameras import Cameras
@@ -40,7 +41,7 @@ _TICKS, _RAMP_TICKS = 25, 15
 _SUBSTEPS = round(_TICK / tabletop.TIME_STEP)
 
 
-class NoOpenGL(RuntimeError):
+class NoOpenGL(UserError):
     """Cameras need OpenGL; the message tells which."""
 
 

@@ -23,17 +23,16 @@ import tyro
 from brax.training.agents.ppo import networks
 from brax.training.agents.ppo import train as ppo
 
-from envs_mjx import registry
 from envs_mjx.adapters.brax import POLICY_KEY, VALUE_KEY, AsBrax, on_recent_jax, wrap
 from envs_mjx.base import DiscreteActions
-from envs_mjx.contract import ContractError, check_contract
+from envs_mjx.contract import check_contract
 from envs_mjx.grid.optimal import optimum
 from mijax import report, runtime
-from mijax.config import Config, ConfigError, EvaluationConfig, parse_seeds, require
+from mijax.config import EvaluationConfig, parse_seeds, require
 from mijax.progress import ProgressDisplay
 from mijax.results import load, summarise
 from mijax.rollout import evaluate
-from mijax.run_folder import RunError, RunFolder
+from mijax.run_folder import RunFolder
 from mijax.seeds import evaluation_key
 from mijax.train import FINAL_EPISODES, CompileClock
 
@@ -91,8 +90,6 @@ class Player:
     env: AsBrax
     act_in_box: Callable[[Any, jax.Array], jax.Array]
     """From parameters and (B, history * width) to (B, action_size)."""
-    config: Config
-    copies: int = 0
 
     def no_action(self, batch: int) -> jax.Array:
         """The previous action of episodes that have not started."""
@@ -165,7 +162,6 @@ class Diary:
         self, options: PPOOptions, env: AsBrax, run: RunFolder, seed: int, progress: ProgressDisplay,
     ) -> None:
         self._options, self._env, self._run, self._seed, self._progress = options, env, run, seed, progress
-        self._config = Config(domain=options.domain, evaluation=EvaluationConfig(episodes=options.episodes))
         self._programs: dict[int, Callable] = {}  # by number of episodes
         self._clock, self._since = CompileClock(), time.perf_counter()
 
@@ -190,23 +186,21 @@ class Diary:
             return make_policy(params, deterministic=True)({POLICY_KEY: seen}, jax.random.PRNGKey(0))[0]
 
         if episodes not in self._programs:
-            player = Player(self._env, in_box, self._config)
+            player, discount = Player(self._env, in_box), EvaluationConfig().discount
             self._programs[episodes] = jax.jit(lambda params, key: jax.tree.map(
-                jnp.mean, evaluate(self._env.env, player, params, episodes, key)))
+                jnp.mean, evaluate(self._env.env, player, params, episodes, key, discount)))
         results = jax.device_get(self._programs[episodes](params, evaluation_key(self._seed, step)))
         return {name: float(value) for name, value in results.items() if name != "value"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
-    try:
+    """The command; returns its exit code."""
+    def work() -> None:
         options = tyro.cli(PPOOptions, args=arguments, prog="python -m examples.brax_ppo")
         runtime.prepare()
         train(options)
-    except (ConfigError, RunError, registry.UnknownDomain, ContractError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+
+    return runtime.exit_code(work)
 
 
 if __name__ == "__main__":

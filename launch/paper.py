@@ -78,7 +78,7 @@ def run_arm(request: Request, domain: str, arm: Arm) -> list[RunFolder]:
     options = request.parse(domain, arm)
     place = folder_of(request, domain, arm, options)
     runs = [RunFolder.open(path) for path in sorted(place.glob("seeds_*")) if (path / "config.json").exists()]
-    runs = [run for run in runs if set(training_of(run).seeds) & set(request.seeds)]
+    runs = [run for run in runs if set(run.config().get("seed_list", ())) & set(request.seeds)]
     for run in runs:
         check_same(run, options)
         if run.summary() is None:

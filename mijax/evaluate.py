@@ -96,11 +96,12 @@ def evaluate_seed(
 ) -> dict[str, float]:
     """Means over greedy episodes, the discounted return in fractions of the best possible where that is known, and of a
     robot task the success by what was touched first."""
+    discount = learner.config.evaluation.discount
     if evaluate_robot.is_robot(learner.env):
-        return evaluate_robot.evaluate_policy(learner.env, actor, state.agent.target, key, episodes)
+        return evaluate_robot.evaluate_policy(learner.env, actor, state.agent.target, key, episodes, discount)
     program = jax.jit(functools.partial(learner.evaluate, actor=actor), static_argnums=2)
     results = {name: float(np.mean(values)) for name, values in program(state, key, episodes).items()}
-    best = optimum(learner.domain, learner.config.evaluation.discount)
+    best = optimum(learner.domain, discount)
     if best is not None:
         results["of_optimum"] = results["discounted_return"] / best.discounted_return
     return results

@@ -98,7 +98,7 @@ def evaluate_random(domain: str, episodes: int, say: Callable[[str], None]) -> "
 
 
 def evaluate_policy(
-    env: "RobotTask", actor: Actor, params: Params, key: jax.Array, episodes: int
+    env: "RobotTask", actor: Actor, params: Params, key: jax.Array, episodes: int, discount: float
 ) -> dict[str, float]:
     """Means over greedy episodes; and success by which object was touched first, the movable or the immovable one, left
     out where that never happened."""
@@ -107,8 +107,8 @@ def evaluate_policy(
     played = trial.policy_trial(
         env, functools.partial(actor.act, params), actor.initial_memory, actor.no_action, key, episodes)
     assert played.movable_first is not None
-    discounts = actor.config.evaluation.discount ** (played.length - 1.0)
-    results = {"success": played.success, "return": played.success, "discounted_return": played.success * discounts,
+    discounted = played.success * discount ** (played.length - 1.0)
+    results = {"success": played.success, "return": played.success, "discounted_return": discounted,
                "length": played.length, "reveals": played.touched}
     rows = zip(HALVES, (played.touched & played.movable_first, played.touched & ~played.movable_first), strict=True)
     results |= {name: played.success[which] for name, which in rows if which.any()}

@@ -69,7 +69,7 @@ class Learner:
         """
         key_agent, key_start, key_warmup, key_run = jax.random.split(key, 4)
         num_envs = self.config.num_envs
-        episodes = start_episodes(self.env, self.agent, num_envs, key_start)
+        episodes = start_episodes(self.env, self.agent, num_envs, key_start, self.agent.copies > 0)
         first = self._first(representation, episodes)
         capacity = max(num_envs + self.demonstrations, self.agent.options.replay_steps // self.env.horizon)
         replay = init_replay(first, capacity, self.env.horizon, kept=self.demonstrations)
@@ -124,7 +124,7 @@ class Learner:
         """Fit Believer's history VAE to as many random episodes as stage 1 has (paper Appendix A.5, Stage 2)."""
         key_start, key_collect, key_update = jax.random.split(key, 3)
         num_envs = self.config.num_envs
-        open_episodes = start_episodes(self.env, self.agent, num_envs, key_start)
+        open_episodes = start_episodes(self.env, self.agent, num_envs, key_start, self.agent.copies > 0)
         first = self._first(state.representation, open_episodes)
         replay = init_replay(first, max(self.config.stage1.episodes, num_envs), self.env.horizon)
         random = dataclasses.replace(
@@ -190,7 +190,8 @@ class Learner:
     def evaluate(self, state: LearnerState, key: jax.Array, num_episodes: int, actor: Actor | None = None) -> Metrics:
         """Greedy episodes of the averaged network: per-episode results, each (num_episodes,); `actor`: played by
         another than the agent."""
-        return evaluate(self.env, actor or self.agent, state.agent.target, num_episodes, key)
+        discount = self.config.evaluation.discount
+        return evaluate(self.env, actor or self.agent, state.agent.target, num_episodes, key, discount)
 
     def recorder(self, representation: Representation | None) -> Recorder:
         """What the replay stores, z_s among it when there is a representation."""

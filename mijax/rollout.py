@@ -9,7 +9,6 @@ from flax import struct
 
 from envs_mjx.base import Environment, EnvState, TimeStep
 from mijax.agents.core import Agent
-from mijax.config import Config
 from mijax.nets.two_branch import MemoryState
 from mijax.replay import Replay, StepRecord, finish, write
 from mijax.types import Metrics, Params
@@ -21,16 +20,6 @@ are stored, their states and the symmetries of their episodes."""
 
 class Actor(Protocol):
     """What plays greedily: an agent, or one that forgets; see `mijax.agents.core.Agent`."""
-
-    @property
-    def config(self) -> Config:
-        """Of the run."""
-        ...
-
-    @property
-    def copies(self) -> int:
-        """Of each episode, that the replay stores."""
-        ...
 
     def no_action(self, batch: int) -> jax.Array:
         """The previous action of episodes that have not started."""
@@ -94,8 +83,10 @@ def select(which: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, old)
 
 
-def start_episodes(env: Environment, agent: Actor, num_envs: int, key: jax.Array) -> Episodes:
-    """Reset every environment."""
+def start_episodes(
+    env: Environment, agent: Actor, num_envs: int, key: jax.Array, symmetric: bool = False
+) -> Episodes:
+    """Reset every environment; `symmetric`: for a replay that stores copies of episodes, moved by a symmetry each."""
     env_state, timestep = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     return Episodes(
         env_state=env_state,
@@ -104,7 +95,7 @@ def start_episodes(env: Environment, agent: Actor, num_envs: int, key: jax.Array
         previous_action=agent.no_action(num_envs),
         position=jnp.zeros((num_envs,), jnp.int32),
         returns=jnp.zeros((num_envs,)),
-        symmetry=draw_symmetry(key, num_envs) if agent.copies else None,
+        symmetry=draw_symmetry(key, num_envs) if symmetric else None,
     )
 
 
@@ -142,18 +133,20 @@ def collect_step(
     )
     replay = finish(replay, done, position + 1)
     running = Episodes(env_state, timestep, memory, action, position, returns, episodes.symmetry)
-    episodes = select(done, start_episodes(env, agent, num_envs, key_reset), running)
+    episodes = select(done, start_episodes(env, agent, num_envs, key_reset, agent.copies > 0), running)
     first = record(episodes.timestep, episodes.previous_action, episodes.env_state, episodes.symmetry)
     return episodes, write(replay, first, episodes.position, keep=done), totals
 
 
-def evaluate(env: Environment, agent: Actor, params: Params, num_episodes: int, key: jax.Array) -> Metrics:
+def evaluate(
+    env: Environment, agent: Actor, params: Params, num_episodes: int, key: jax.Array, discount: float
+) -> Metrics:
     """Greedy episodes, side by side: per-episode results, each (num_episodes,).
 
-    The discounted return is sum_t gamma^t r_{t+1}; `value` is what the agent promises itself of it, and of the bonus,
-    on the first observation: far above the return means that it believes episodes it has learnt by heart.
+    The discounted return is sum_t gamma^t r_{t+1}, gamma = `discount`; `value` is what the agent promises itself of it,
+    and of the bonus, on the first observation: far above the return means that it believes episodes it has learnt by
+    heart.
     """
-    discount = agent.config.evaluation.discount
     key_start, key_steps = jax.random.split(key)
     episodes = start_episodes(env, agent, num_episodes, key_start)
     false = jnp.zeros((num_episodes,), bool)

@@ -86,17 +86,21 @@ class RunFolder:
             return
         for name in ("config.json", "versions.json"):
             self._file(name).unlink(missing_ok=True)
-        if not any(self.path.iterdir()):
+        with contextlib.suppress(OSError):  # it holds something else, or is where the program works
             self.path.rmdir()
 
     def config(self) -> dict[str, Any]:
         """The run's options, as written by `create`."""
         return _read_json(self._file("config.json"))
 
-    def extend(self, steps: int) -> None:
-        """Give the run another budget of environment steps, so that it has not ended."""
-        self._file("summary.json").unlink(missing_ok=True)
-        _write_json(self._file("config.json"), self.config() | {"steps": steps})
+    def amend(self, *, steps: int, track: str) -> None:
+        """Go on under another budget of environment steps, so that the run has not ended, or with another tracker."""
+        config = self.config()
+        if config.get("steps") != steps:
+            self._file("summary.json").unlink(missing_ok=True)
+        changed = config | {"steps": steps, "track": track}
+        if changed != config:
+            _write_json(self._file("config.json"), changed)
 
     def versions(self) -> dict[str, Any]:
         """What the run was started with: python, packages, platform, commit."""

@@ -158,7 +158,7 @@ def _areas(run: ReportedRun, start: int, last: int) -> np.ndarray:
     """(seeds,) mean success over the steps up to `last`, the first `start` of which were stage 1's."""
     def area(steps: np.ndarray, values: np.ndarray) -> float:
         apart = (steps[-1] - steps[0]) / max(len(steps) - 1, 1)  # evaluations are evenly spaced
-        evaluations = (last - steps[0]) / apart + 1 if apart else 1.0
+        evaluations = max((last - steps[0]) // apart + 1, 1) if apart else 1
         return float(values[start + steps <= last].sum() / evaluations)
 
     return np.array([area(steps, values) for steps, values in run.curves("evaluation/success")])

@@ -23,14 +23,14 @@ from envs_mjx.errors import UserError
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of, unread_groups
-from mijax.config import Config, Stage1Config, options_of, parse_seeds, require
+from mijax.config import Config, Stage1Config, config_from_dict, options_of, parse_seeds, require
 from mijax.learner import Learner, make_learner
 from mijax.progress import ProgressDisplay
 from mijax.results import load, summarise
 from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import SeedRunner, training_key
 from mijax.trackers import TrackerName, make_tracker, require_tracker
-from mijax.trained import Training, stage1_in, training_of
+from mijax.trained import Training, training_of
 
 FINAL_EPISODES = 500
 """Greedy episodes of each seed behind the numbers of summary.json."""
@@ -105,7 +105,8 @@ def unread_options(config: Config, env: Environment) -> list[str]:
 def _require_kind(source: RunFolder, wanted: Stage1Config) -> None:
     """Raise `ConfigError` unless another run's features are of the kind that an agent is about: Believer's or ours."""
     stored = source.config()
-    other = stage1_of(training_of(source).config) if "agent" in stored else stage1_in(stored)
+    read = config_from_dict({name: stored[name] for name in ("agent", "stage1") if name in stored})
+    other = stage1_of(read) if "agent" in stored else read.stage1
     kinds = {True: "Believer's (a KL penalty)", False: "ours (CLUB)"}
     require((other.lambda_kl > 0) == (wanted.lambda_kl > 0), "representation", str(source.path),
             f"a run with features of the other kind: {kinds[wanted.lambda_kl > 0]}")
@@ -116,8 +117,7 @@ def open_run(options: TrainOptions, fill: Callable[[RunFolder], None] | None = N
     config = options.config
     if options.resume is not None:
         run = RunFolder.open(options.resume)
-        if run.config()["steps"] != config.steps:
-            run.extend(config.steps)
+        run.amend(steps=config.steps, track=options.track)
         return run
     name = f"{registry.file_name(config.domain)}-{config.agent}-{memory_of(config)}"
     training = Training(config, parse_seeds(options.seeds), options.track)
@@ -225,7 +225,8 @@ def _start(
         runner.init(learnt)
         shown = all(runner.learner.has_demonstrations(state) for state in runner.states().values())
         require(shown, "sac.demonstrations", runner.learner.demonstrations,
-                f"0, as the expert of {runner.learner.env.name} solves none of its episodes")
+                f"0, as the expert of {runner.learner.env.name} solves none of its episodes; in another --out, with "
+                f"--representation {run.path} where stage 1 is done")
         runtime.release_memory()
 
 

@@ -13,7 +13,15 @@ import pytest
 
 import configs
 from envs_mjx import registry
-from envs_mjx.base import ArraySpec, ContinuousActions, Demonstrations, Environment, EnvState, TimeStep
+from envs_mjx.base import (
+    ArraySpec,
+    ContinuousActions,
+    Demonstrations,
+    DiscreteActions,
+    Environment,
+    EnvState,
+    TimeStep,
+)
 from envs_mjx.contract import ContractError, check_contract
 from envs_mjx.grid import HeavenHell
 from envs_mjx.grid.world import GridState, GridWorld
@@ -241,7 +249,7 @@ def _with(**attributes):
     return type("Broken", (HeavenHell,), attributes)()
 
 
-def _resetting(where: int, shown_only: bool = False):
+def _resetting(where: int):
     """Heaven-Hell, short, whose step resets at the end: with its own key, or the first or second split from it."""
 
     class Resetting(HeavenHell):
@@ -252,8 +260,7 @@ def _resetting(where: int, shown_only: bool = False):
             begun, first = self.reset([key, *jax.random.split(key)][where])
             first = dataclasses.replace(
                 first, reward=last.reward, terminated=last.terminated, truncated=last.truncated)
-            begun, shown = jax.tree.map(lambda x, y: jnp.where(last.done, x, y), (begun, first), (env_state, last))
-            return env_state if shown_only else begun, shown
+            return jax.tree.map(lambda x, y: jnp.where(last.done, x, y), (begun, first), (env_state, last))
 
     return Resetting()
 
@@ -268,7 +275,6 @@ def _resetting(where: int, shown_only: bool = False):
     (_with(horizon=0), "horizon is 0, expected at least 1"),
     (_with_timestep(truncated=jnp.zeros_like), "an episode is not over after its horizon of 50 steps"),
     *((_resetting(where), "step returns the first moment of a new episode where one ends") for where in range(3)),
-    (_resetting(0, shown_only=True), "step returns the first moment of a new episode where one ends"),
     (_with(observation_spec=ArraySpec((3, 1))), r"observation_spec is \(3, 1\), expected a vector \(D,\) or an image"),
     (_with(state_spec=ArraySpec(())), r"state_spec is \(\), expected a vector"),
     (_with(__eq__=lambda self, other: True, __hash__=None), "cannot be hashed, as programs compiled for it"),
@@ -298,3 +304,26 @@ def test_broken_contracts(env: Environment, message: str) -> None:
     with pytest.raises(ContractError, match=message) as caught:
         check_contract(env)
     assert "\n" not in str(caught.value)
+
+
+class _Contexts(Environment):
+    """Legal: what a step shows is drawn as a reset draws it; a key of JAX's own type is remembered."""
+
+    name, horizon = "contexts", 3
+    observation_spec = state_spec = ArraySpec((1,))
+    action_spec = DiscreteActions(2)
+
+    def reset(self, key):
+        return (jnp.int32(0), key), self._show(key, jnp.int32(0))
+
+    def step(self, key, env_state, action):
+        del action
+        return (env_state[0] + 1, env_state[1]), self._show(key, env_state[0] + 1)
+
+    def _show(self, key, time):
+        seen = jax.random.uniform(key, (1,))
+        return TimeStep(seen, seen, jnp.zeros(()), jnp.zeros((), bool), time >= self.horizon)
+
+
+def test_what_looks_like_a_reset_may_be_none() -> None:
+    check_contract(_Contexts())

@@ -106,7 +106,7 @@ def test_a_run_starts_with_its_representations_or_not_at_all(tmp_path):
 
 def test_another_budget_makes_a_run_go_on(run):
     run.write_summary({})
-    run.extend(9000)
+    run.amend(steps=9000, track="none")
     assert run.summary() is None
     assert run.config() == {**RunFolder.open(run.path).config(), "steps": 9000}
 

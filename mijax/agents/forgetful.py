@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from flax import struct
 
 from mijax.agents.core import Agent
-from mijax.config import Config
 from mijax.nets.two_branch import MemoryState
 from mijax.types import Params
 
@@ -27,16 +26,6 @@ class Forgetful:
 
     agent: Agent
     steps: int
-
-    @property
-    def config(self) -> Config:
-        """The agent's."""
-        return self.agent.config
-
-    @property
-    def copies(self) -> int:
-        """The agent's."""
-        return self.agent.copies
 
     def no_action(self, batch: int) -> jax.Array:
         """The agent's."""

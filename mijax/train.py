@@ -94,12 +94,15 @@ def _resumed(known: argparse.Namespace, others: Sequence[str], arguments: Sequen
 
 
 def unread_options(config: Config, env: Environment) -> list[str]:
-    """Options that differ from both presets, and that the agent never looks at."""
+    """Options that differ from both presets, and that the agent never looks at, or replaces: Believer some of stage 1.
+    """
     ours = configs.preset(config.domain)
     presets = [options_of(preset) for preset in (ours, paper(ours, not env.observation_spec.is_image))]
     unread = unread_groups(config, continuous=isinstance(env.action_spec, ContinuousActions))
+    used = options_of(dataclasses.replace(config, stage1=stage1_of(config)))
     return [f"--{name.replace('_', '-')}" for name, value in options_of(config).items()
-            if name.split(".")[0] in unread and all(preset[name] != value for preset in presets)]
+            if (name.split(".")[0] in unread or used[name] != value)
+            and all(preset[name] != value for preset in presets)]
 
 
 def _require_kind(source: RunFolder, wanted: Stage1Config) -> None:

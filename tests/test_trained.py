@@ -104,6 +104,8 @@ def test_options_that_are_not_read_are_named() -> None:
     options = train.parse(["--agent", "base", "--dqn.discount", "0.9", "--sac.discount", "0.5", "--zp.weight", "3"])
     unread = train.unread_options(options.config, registry.make("heaven_hell"))
     assert unread == ["--sac.discount", "--zp.weight"]
+    options = train.parse(["--agent", "believer", "--stage1.lambda-club", "3", "--stage1.lambda-r", "3"])
+    assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--stage1.lambda-club"]
     assert train.unread_options(train.parse(["--preset", "paper"]).config, registry.make("heaven_hell")) == []
 
 

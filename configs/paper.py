@@ -13,7 +13,8 @@ INTRINSIC_WEIGHT = {"heaven_hell": 10.0, "sphinx": 10.0, "carflag_2d": 0.0} | di
 STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000} | dict.fromkeys(ROBOTS, 40_000)
 """10 000, 20 000 and 800 episodes of 50 steps."""
 EPOCHS = 1000
-TABLE_3 = {"sphinx": {"learning_rate": 1e-3},
+TABLE_3 = {"heaven_hell": {"episodes": 500},
+           "sphinx": {"learning_rate": 1e-3},
            "carflag_2d": {"learning_rate": 1e-3, "episodes": 1000, "lambda_r": 1.0},
            "block_pulling": {"learning_rate": 1e-3, "batch_size": 500, "lambda_r": 10.0, "lambda_s": 0.1,
                              "lambda_club": 10.0, "lambda_dim_s": 0.1},
@@ -39,7 +40,7 @@ def paper(config: Config, vector_observation: bool) -> Config:
     sac = dataclasses.replace(
         config.sac, learning_rate=3e-4, final_learning_rate=1.0, discount=0.99, trace_decay=0.0, target_rate=0.005,
         batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0,
-        pretrain_updates=0, imitation_weight=0.0, rotated_copies=4, replay_steps=100_000)
+        pretrain_updates=0, imitation_weight=0.0, imitate_successes=False, rotated_copies=4, replay_steps=100_000)
     information = dataclasses.replace(
         config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(domain, 10.0),
         intrinsic_form="cosine")

@@ -24,7 +24,7 @@ from mijax.config import (
 
 def robot(
     domain: str, copies: int, epochs: int, lambda_club: float = 0.3, trunk: TrunkKind = "psi",
-    updates_per_step: float = 0.5, imitation_final: float = 0.1,
+    updates_per_step: float = 0.5, imitation_final: float = 0.1, imitate_successes: bool = False,
 ) -> Config:
     """The preset of a robot task.
 
@@ -36,6 +36,7 @@ def robot(
         trunk: what looks at frames (`SACConfig`).
         updates_per_step: fewer where the trunk learns too, at six times the cost.
         imitation_final: what imitation fades to.
+        imitate_successes: whether the agent's own successes are imitated too.
     """
     return Config(
         domain=domain,
@@ -49,7 +50,7 @@ def robot(
         sac=SACConfig(trunk=trunk, learning_rate=1e-3, final_learning_rate=0.05, trace_decay=0.8, target_rate=0.01,
                       updates_per_step=updates_per_step, replay_steps=50_000, demonstrations=80,
                       demonstration_share=0.25, pretrain_updates=2000, imitation_weight=2.0, imitation_until=0.5,
-                      imitation_final=imitation_final, rotated_copies=24),
+                      imitation_final=imitation_final, imitate_successes=imitate_successes, rotated_copies=24),
         zp=SelfPredictionConfig(weight=0.1),
         # The paper's weight of 0.1 paid up to 0.35 for an episode of moving about, as z_s holds what moves too: a
         # solved agent went back from 1.0 to 0.44 within 10 000 steps.

@@ -234,6 +234,9 @@ class SACConfig:
     """Fraction of the run's updates over which that weight falls linearly ..."""
     imitation_final: float = 0.0
     """... to this fraction of itself, which stays."""
+    imitate_successes: bool = False
+    """Whether the mean also comes near the actions of the agent's own episodes that return as much as the median
+    demonstration: 80 demonstrations show few scenes. The scale keeps to the demonstrations."""
     rotated_copies: int = 0
     """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
     original (paper: 4 on the robots)."""
@@ -261,6 +264,8 @@ class SACConfig:
             value = getattr(self, name)
             require(self.demonstrations > 0 or value == 0, f"sac.{name}".replace("_", "-"), value,
                     "0, unless there are --sac.demonstrations")
+        require(self.imitation_weight > 0 or not self.imitate_successes, "sac.imitate-successes",
+                self.imitate_successes, "False, unless there is an --sac.imitation-weight")
 
     def updates_in(self, steps: int) -> int:
         """Gradient updates of a run of so many environment steps."""

@@ -26,7 +26,7 @@ from mijax.frames import FrameTable
 from mijax.nets.actor_critic import shown
 from mijax.nets.encoders import encoder_for
 from mijax.packing import Layout, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
-from mijax.replay import Replay, StepRecord, fill, init_replay, sample_episodes, write
+from mijax.replay import Replay, StepRecord, fill, init_replay, returns_of, sample_episodes, write
 from mijax.rollout import (
     Actor,
     Episodes,
@@ -290,8 +290,13 @@ class Learner:
         """(B,) episodes in so many rows, shown again where the replay stores moments."""
         tokens = gather_rows(replay, slots, layout, rows, self.observations)
         if self.demonstrations and self.config.sac.imitation_weight > 0:
+            episode = jnp.maximum(tokens.segment - 1, 0)
             expert = (slots >= self.config.num_envs) & (slots < self.config.num_envs + self.demonstrations)
-            tokens = dataclasses.replace(tokens, demonstrated=expert[jnp.maximum(tokens.segment - 1, 0)])
+            tokens = dataclasses.replace(tokens, demonstrated=expert[episode])
+            if self.config.sac.imitate_successes:
+                enough = jnp.median(returns_of(replay, replay.finished[: self.demonstrations]))
+                succeeded = returns_of(replay, slots) >= enough
+                tokens = dataclasses.replace(tokens, succeeded=succeeded[episode])
         copies, batch, key = self.agent.copies, slots.shape[0], jax.random.fold_in(key, 2)
         if self.moments:
             wants_state = self.agent.declaration.critic is not None

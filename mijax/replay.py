@@ -110,6 +110,13 @@ def fill(replay: Replay, records: StepRecord, length: jax.Array) -> Replay:
     )
 
 
+def returns_of(replay: Replay, slots: jax.Array) -> jax.Array:
+    """(B,) undiscounted returns of the finished episodes in (B,) `slots`."""
+    reward = replay.data.reward[slots]
+    taken = jnp.arange(reward.shape[1])[None] < replay.length[slots][:, None]
+    return jnp.sum(reward, axis=1, where=taken)
+
+
 def sample_episodes(replay: Replay, key: jax.Array, batch: int, share: float = 0.0) -> jax.Array:
     """(batch,) int32 slots of finished episodes, uniform with replacement whatever their length; with a `share`, each
     is uniform over the kept ones with that probability.

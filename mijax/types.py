@@ -53,6 +53,7 @@ class Tokens:
     states: jax.Array | None = None  # (R L, *state_shape) for asymmetric critics
     symmetry: jax.Array | None = None  # (R, L, 2) uint32, while frames are moments: see `mijax.augmentation`
     demonstrated: jax.Array | None = None  # (R, L) bool, whether an expert acted in the episode; None: not wanted
+    succeeded: jax.Array | None = None  # (R, L) bool, whether it returns what an expert's does; None: not wanted
 
     def folds(self) -> "tuple[Tokens, Tokens]":
         """The upper and the lower half of the rows: of a batch of `sample_episodes`, its two folds."""

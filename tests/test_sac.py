@@ -171,19 +171,27 @@ IMITATING = dataclasses.replace(
     CONFIG.sac, demonstrations=1, imitation_weight=1.0, imitation_until=0.5, imitation_final=0.2)
 
 
-def test_losses_by_hand_with_imitation():
-    """The first and the last episode are an expert's."""
+@pytest.mark.parametrize("successes", [False, True])
+def test_losses_by_hand_with_imitation(successes: bool):
+    """The first and the last episode are an expert's; the mean may imitate the second one too."""
     case = Case("base", sac=dataclasses.replace(IMITATING, bootstrap_at_time_limit=False, trace_decay=0.0))
-    case.tokens = dataclasses.replace(case.tokens, demonstrated=case.tokens.segment != 2)
+    second = case.tokens.segment == 2
+    case.tokens = dataclasses.replace(case.tokens, demonstrated=~second, succeeded=second if successes else None)
     expected, taken = losses_by_loops(case, np.zeros((2, ROW))), taken_actions(case)
     mean, log_scale, _, _ = case.says(case.params, case.tokens, taken)
-    shown = [(row, t) for row, first, end in (SPANS[0], SPANS[2]) for t in range(first, end - 1)]
-    moves = np.array([np.tanh(mean[at]) - taken[at] for at in shown])
-    scales = np.array([log_scale[at] for at in shown])
+
+    def distances(*spans: tuple[int, int, int]) -> np.ndarray:
+        """Of the mean to each coordinate of the actions taken."""
+        return np.array([np.tanh(mean[row, t]) - taken[row, t] for row, first, end in spans
+                         for t in range(first, end - 1)])
+
+    moves = distances(SPANS[0], SPANS[2])
+    scales = np.array([log_scale[row, t] for row, first, end in (SPANS[0], SPANS[2]) for t in range(first, end - 1)])
     variances = np.exp(2 * scales)
     misfit = np.mean(np.sum(variances * (moves**2 / (2 * variances) + scales), axis=-1))
     expected["actor/distance"] = np.mean(np.sum(moves**2, axis=-1))
-    expected["loss/imitation"] = expected["actor/distance"] + misfit
+    near = distances(*SPANS) if successes else moves
+    expected["loss/imitation"] = np.mean(np.sum(near**2, axis=-1)) + misfit
     quarter = case.config.sac.updates_in(CONFIG.steps) // 4  # half of the way from 1 to 0.2
     check_losses(case, quarter, expected, {"loss/imitation": 0.6})
 
@@ -329,6 +337,8 @@ def test_titles_follow_the_algorithm():
     ({"updates_per_step": 0.05}, "--sac.updates-per-step: got 0.05"),
     ({"imitation_weight": 1.0}, "--sac.imitation-weight: got 1.0, accepted: 0, unless there are --sac.demonstrations"),
     ({"pretrain_updates": 9}, "--sac.pretrain-updates: got 9, accepted: 0, unless there are --sac.demonstrations"),
+    ({"imitate_successes": True},
+     "--sac.imitate-successes: got True, accepted: False, unless there is an --sac.imitation-weight"),
     ({"batch_episodes": 7}, "--sac.batch-episodes: got 7, accepted: an even number"),
     ({"initial_temperature": 0.0}, "--sac.initial-temperature: got 0.0, accepted: a number > 0"),
 ])
@@ -378,6 +388,22 @@ def test_demonstrations_are_in_the_replay_from_the_start(ours: tuple[Run, Learne
         np.testing.assert_allclose(actions[1:4], 0.8 * np.asarray(moments.cue)[:3], rtol=1e-6)
         assert data.reward[3] == 1
         assert bool(data.terminated[3])
+
+
+@pytest.mark.lenient
+def test_successes_are_known(ours: tuple[Run, LearnerState]):
+    """Episodes that return what demonstrations do, demonstrations among them."""
+    state = ours[1]
+    config = dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, imitation_weight=1.0, imitate_successes=True))
+    learner, replay = make_learner(Compass(), config, pack=False), state.replay
+    number = int(replay.count)
+    slots = replay.finished[jnp.arange(8) % number]
+    pointed = np.asarray(replay.data.reward[slots, Compass.choice + 1]) > 0
+    assert pointed.any()
+    assert not pointed.all()
+    tokens = jax.jit(lambda slots: learner._read(replay, slots, one_per_row(8), 8, jax.random.key(0)))(slots)
+    real = np.asarray(tokens.segment) > 0
+    np.testing.assert_array_equal(np.asarray(tokens.succeeded)[real], np.repeat(pointed[:, None], 5, axis=1)[real])
 
 
 class Clumsy(Compass):

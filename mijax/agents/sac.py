@@ -226,11 +226,13 @@ class SAC(Agent):
         return loss, log_prob, {"loss/actor": loss}
 
     def _imitation(self, agent: Params, online: Encoded, tokens: Tokens) -> tuple[jax.Array, Metrics]:
-        """The loss over the transitions of demonstrations, and how far the mean is from them."""
+        """The loss over the transitions of what is imitated, and how far the mean is from demonstrations."""
         mean, log_scale = (
             x.reshape(*tokens.segment.shape, -1)[:, :-1] for x in self._call("policy", agent, online.actor))
-        mask = transitions(tokens) & cast(jax.Array, tokens.demonstrated)[:, :-1]
-        return sac.imitation_loss(jnp.tanh(mean), log_scale, tokens.previous_action[:, 1:], mask)
+        demonstrated, succeeded = (
+            None if of is None else transitions(tokens) & of[:, :-1] for of in (tokens.demonstrated, tokens.succeeded))
+        return sac.imitation_loss(
+            jnp.tanh(mean), log_scale, tokens.previous_action[:, 1:], cast(jax.Array, demonstrated), succeeded)
 
     def _critic(
         self, agent: Params, online: Encoded, soft_value: jax.Array, bonus: jax.Array, tokens: Tokens

@@ -59,7 +59,8 @@ def actor_loss(log_prob: jax.Array, q: jax.Array, temperature: jax.Array, mask: 
 
 
 def imitation_loss(
-    action: jax.Array, log_scale: jax.Array, demonstrated: jax.Array, mask: jax.Array
+    action: jax.Array, log_scale: jax.Array, demonstrated: jax.Array, mask: jax.Array,
+    further: jax.Array | None = None
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """E[ |a - a*|^2 + sum_i sg(sigma_i^2) ( sg(a_i - a*_i)^2 / (2 sigma_i^2) + log sigma_i ) ]. Not the paper's.
 
@@ -73,16 +74,20 @@ def imitation_loss(
         log_scale: (..., A) log sigma, before squashing.
         demonstrated: (..., A) a*.
         mask: (...) bool, the transitions of demonstrations.
+        further: (...) bool, other transitions that the mean, and not the scale, is to imitate: of episodes that the
+            actor drew from that scale.
 
     Returns:
-        () loss; the mean squared distance.
+        () loss; the mean squared distance to demonstrations.
     """
     chex.assert_equal_shape([action, log_scale, demonstrated])
+    near = mask if further is None else mask | further
     square = jnp.square(action - demonstrated)
     misfit = jax.lax.stop_gradient(square) / 2 * jnp.exp(-2 * log_scale) + log_scale
     misfit *= jax.lax.stop_gradient(jnp.exp(2 * log_scale))
-    distance = masked_mean(jnp.sum(square, axis=-1), mask)
-    return distance + masked_mean(jnp.sum(misfit, axis=-1), mask), {"distance": distance}
+    distance = jnp.sum(square, axis=-1)
+    loss = masked_mean(distance, near) + masked_mean(jnp.sum(misfit, axis=-1), mask)
+    return loss, {"distance": masked_mean(distance, mask)}
 
 
 def temperature_loss(

@@ -6,8 +6,8 @@ are cheap: frames are looked at once, by psi's body, for every agent alike (six 
 trunk learns), there is at most half an update for each step, with returns that reach further back, and no dropout, so
 that one pass serves gradients and targets. Every agent begins on the demonstrations alone and imitates them, less and
 less for half of the run, then a little (on Drawer-Opening always as much, and its own successes too): without, none
-learns to change over, as the critics tell a demonstration by its history and not by its actions. Stage 1 sees copies of each demonstrated transition
-as Table 3 has them, for a budget of minutes. Measurements: results/robots.
+learns to change over, as the critics tell a demonstration by its history and not by its actions. Stage 1 sees copies
+of each demonstrated transition as Table 3 has them, for a budget of minutes. Measurements: results/robots.
 """
 
 from mijax.config import (

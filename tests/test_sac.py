@@ -483,7 +483,8 @@ def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
     ("ua", "psi"), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (
         ("ua", "shared"), ("believer", "shared"), ("believer", "psi"), ("base", "psi"), ("mdp", "shared")))])
 def test_every_agent_runs_in_the_loop(agent: str, trunk: Any):
-    sac = dataclasses.replace(LOOP.sac, trunk=trunk, pretrain_updates=3, imitation_weight=1.0)
+    sac = dataclasses.replace(
+        LOOP.sac, trunk=trunk, pretrain_updates=3, imitation_weight=1.0, imitate_successes=True)
     run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", sac=sac,
                                   stage1=Stage1Config(features=FEATURES, episodes=4)))
     state, metrics = run.chunk(run.start())

@@ -49,6 +49,8 @@ class Demonstrations:
     action: jax.Array  # (N, T, ...)  action t leads from moment t to moment t + 1
     length: jax.Array  # (N,) int32  steps of each episode
     success: jax.Array  # (N,) bool  whether the episode solved the task
+    intended: jax.Array | None = None  # (N, T, ...)  what the expert meant to do, and is to be imitated; None: what it
+    # did
 
 
 @dataclasses.dataclass(frozen=True)

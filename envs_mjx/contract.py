@@ -141,9 +141,10 @@ def _check_demonstrations(env: Environment, key: jax.Array, env_state: EnvState,
     _require(env, isinstance(shown, Demonstrations), "what demonstrations returns", type(shown).__name__,
              "Demonstrations or None")
     _check_same_structure(env, "demonstrations", env_state, shown.env_state, (number, env.horizon + 1))
+    actions = ArraySpec((number, env.horizon, *action.shape), action.dtype)
     for name, expected in (
-        ("action", ArraySpec((number, env.horizon, *action.shape), action.dtype)),
-        ("length", ArraySpec((number,), np.int32)), ("success", ArraySpec((number,), bool)),
+        ("action", actions), ("length", ArraySpec((number,), np.int32)), ("success", ArraySpec((number,), bool)),
+        *([] if shown.intended is None else [("intended", actions)]),
     ):
         _check_array(env, f"{name} of demonstrations", getattr(shown, name), expected)
     _check_timestep(env, "show", _evaluate(env, "show", env.show, env_state))

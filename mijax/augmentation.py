@@ -5,7 +5,7 @@ Block-Pulling takes less time than turning its stored image (`envs_mjx.robot.tas
 """
 
 import dataclasses
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -25,19 +25,23 @@ def shows_again(env: Environment) -> bool:
 
 
 def show_copy(
-    env: Environment, symmetry: jax.Array, copy: jax.Array, env_state: EnvState, action: jax.Array
-) -> tuple[TimeStep, jax.Array]:
-    """What one moment shows in one copy of its episode, and the action (A,) that led to it there.
+    env: Environment, symmetry: jax.Array, copy: jax.Array, env_state: EnvState, actions: Any
+) -> tuple[TimeStep, Any]:
+    """What one moment shows in one copy of its episode, and what actions are there.
 
     Args:
         env: shows moments again.
         symmetry: (2,) uint32, drawn once per episode; draws the symmetry of each of its copies.
         copy: () int32; copy 0 is the episode as it was.
+        actions: a pytree of actions, (A,) each, such as the one that led to this moment.
     """
     key = jax.random.fold_in(jax.random.wrap_key_data(symmetry), copy)
-    moved = env.augment(key, env_state, action)
-    env_state, action = jax.tree.map(lambda a, b: jnp.where(copy == 0, a, b), (env_state, action), moved)
-    return env.show(env_state), action
+    first, *rest = jax.tree.leaves(actions)
+    there, first = env.augment(key, env_state, first)
+    moved = there, [first, *(env.augment(key, env_state, action)[1] for action in rest)]
+    here = env_state, jax.tree.leaves(actions)
+    env_state, leaves = jax.tree.map(lambda a, b: jnp.where(copy == 0, a, b), here, moved)
+    return env.show(env_state), jax.tree.unflatten(jax.tree.structure(actions), leaves)
 
 
 def draw_copies(tokens: Tokens, copies: int, batch: int, key: jax.Array) -> jax.Array:
@@ -58,7 +62,8 @@ def take_copies(tokens: Tokens, copies: int, batch: int, key: jax.Array) -> Toke
     states = None if tokens.states is None else _take(tokens.states, copy.reshape(-1))
     z_s = None if tokens.z_s is None else _take(tokens.z_s, copy)
     return dataclasses.replace(
-        tokens, frames=frames, states=states, previous_action=_take(tokens.previous_action, copy), z_s=z_s)
+        tokens, frames=frames, states=states, previous_action=_take(tokens.previous_action, copy), z_s=z_s,
+        intended=None if tokens.intended is None else _take(tokens.intended, copy))
 
 
 def _take(x: jax.Array, copy: jax.Array) -> jax.Array:
@@ -74,17 +79,18 @@ def show_tokens(env: Environment, tokens: Tokens, copies: int, batch: int, key: 
         copies: besides the original.
         states: whether the states are wanted too.
     """
-    flat = tokens.previous_action.reshape(-1, *tokens.previous_action.shape[2:])
+    actions, z_s = (tokens.previous_action, tokens.intended), tokens.z_s
     if copies == 0:
-        timestep, action, z_s = jax.vmap(env.show)(tokens.frames), flat, tokens.z_s
+        timestep = jax.vmap(env.show)(tokens.frames)
     else:
         copy = draw_copies(tokens, copies, batch, key)
         symmetry = cast(jax.Array, tokens.symmetry).reshape(-1, 2)
-        timestep, action = jax.vmap(lambda *moment: show_copy(env, *moment))(
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), actions)
+        timestep, moved = jax.vmap(lambda *moment: show_copy(env, *moment))(
             symmetry, copy.reshape(-1), tokens.frames, flat)
-        z_s = tokens.z_s
+        actions = jax.tree.map(lambda x, like: x.reshape(like.shape), moved, actions)
         if z_s is not None:
             z_s = _take(z_s, copy)
     return dataclasses.replace(
-        tokens, frames=timestep.observation, previous_action=action.reshape(tokens.previous_action.shape), z_s=z_s,
+        tokens, frames=timestep.observation, previous_action=actions[0], intended=actions[1], z_s=z_s,
         states=timestep.state if states else None, symmetry=None)

@@ -8,7 +8,7 @@ devices, checkpoints and logging are wrapped around these two functions.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -104,12 +104,13 @@ class Learner:
         symmetries = draw_symmetry(key_symmetry, self.demonstrations)
 
         def store(episode: tuple) -> StepRecord:
-            env_state, action, symmetry = episode
-            previous = jnp.concatenate([none, action.astype(none.dtype)])
+            env_state, *actions, symmetry = episode
+            previous, intended = (jnp.concatenate([none, action.astype(none.dtype)]) for action in actions)
             symmetry = jnp.broadcast_to(symmetry[None], (previous.shape[0], 2)) if self.agent.copies else None
-            return record(jax.vmap(self.env.show)(env_state), previous, env_state, symmetry)
+            return record(jax.vmap(self.env.show)(env_state), previous, env_state, symmetry, intended)
 
-        records = jax.lax.map(store, (shown.env_state, shown.action, symmetries))
+        intended = shown.action if shown.intended is None else shown.intended
+        records = jax.lax.map(store, (shown.env_state, shown.action, intended, symmetries))
         order = jnp.argsort(~shown.success, stable=True)
         order = order[jnp.arange(self.demonstrations) % jnp.maximum(jnp.sum(shown.success), 1)]
         records, length = jax.tree.map(lambda x: x[order], (records, shown.length))
@@ -148,6 +149,11 @@ class Learner:
     def demonstrations(self) -> int:
         """Episodes of an expert in the replay from the start."""
         return self.config.sac.demonstrations if self.agent.group == "sac" else 0
+
+    @property
+    def imitates(self) -> bool:
+        """Whether demonstrations are imitated."""
+        return self.demonstrations > 0 and self.config.sac.imitation_weight > 0
 
     @property
     def updates_per_iteration(self) -> int:
@@ -202,21 +208,22 @@ class Learner:
         table, declaration = self.observations, self.agent.declaration
 
         def in_copies(
-            timestep: TimeStep, action: jax.Array, env_state: EnvState, symmetry: jax.Array | None
-        ) -> tuple[TimeStep, jax.Array]:
+            timestep: TimeStep, actions: Any, env_state: EnvState, symmetry: jax.Array | None
+        ) -> tuple[TimeStep, Any]:
             """What every copy shows, and the actions there: (E, 1 + copies, ...) each, where there are copies."""
             if symmetry is None:
-                return timestep, action
+                return timestep, actions
             moved = jax.vmap(jax.vmap(functools.partial(show_copy, self.env), (None, 0, None, None)), (0, None, 0, 0))
-            return moved(symmetry, jnp.arange(copies + 1, dtype=jnp.int32), env_state, action)
+            return moved(symmetry, jnp.arange(copies + 1, dtype=jnp.int32), env_state, actions)
 
         def record(
             timestep: TimeStep, previous_action: jax.Array, env_state: EnvState = None,
-            symmetry: jax.Array | None = None,
+            symmetry: jax.Array | None = None, intended: jax.Array | None = None,
         ) -> StepRecord:
+            intended = (previous_action if intended is None else intended) if self.imitates else None
             z_s, observation, state = None, env_state if self.moments else timestep.observation, timestep.state
             if representation is not None and not declaration.sees_state:
-                copied, actions = in_copies(timestep, previous_action, env_state, symmetry)
+                copied, actions = in_copies(timestep, (previous_action, intended), env_state, symmetry)
                 if declaration.uses_representation:
                     z_s = cast(jax.Array, phi.apply({"params": representation.phi}, copied.state))
                 if self.agent.looks_once:
@@ -225,7 +232,7 @@ class Learner:
                         cast(jax.Array, encoder.apply({"params": params}, x, method="body")).astype(jnp.float16)
                         for encoder, params, x in ((psi, representation.psi, seen),
                                                    (phi, representation.phi, copied.state)))
-                    previous_action = actions
+                    previous_action, intended = actions
             if table is not None:
                 observation = table.index_of(timestep.observation).astype(_integer_for(len(table)))
             return StepRecord(
@@ -236,6 +243,7 @@ class Learner:
                 truncated=timestep.truncated,
                 z_s=z_s,
                 state=None if declaration.critic is None or self.moments else state,
+                intended=intended,
                 symmetry=symmetry,
             )
 
@@ -289,7 +297,7 @@ class Learner:
     def _read(self, replay: Replay, slots: jax.Array, layout: Layout, rows: int, key: jax.Array) -> Tokens:
         """(B,) episodes in so many rows, shown again where the replay stores moments."""
         tokens = gather_rows(replay, slots, layout, rows, self.observations)
-        if self.demonstrations and self.config.sac.imitation_weight > 0:
+        if self.imitates:
             episode = jnp.maximum(tokens.segment - 1, 0)
             expert = (slots >= self.config.num_envs) & (slots < self.config.num_envs + self.demonstrations)
             tokens = dataclasses.replace(tokens, demonstrated=expert[episode])

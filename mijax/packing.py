@@ -93,6 +93,7 @@ def gather_rows(
         position=shaped(jnp.where(used, position, 0)),
         z_s=None if data.z_s is None else shaped(data.z_s.astype(jnp.float32)),
         states=data.state,
+        intended=None if data.intended is None else shaped(_actions(data.intended, used)),
         symmetry=None if data.symmetry is None else shaped(data.symmetry),
     )
 

@@ -28,6 +28,7 @@ class StepRecord:
     z_s: jax.Array | None  # (E, F) phi(s_t), labelled once on collection, or (E, 1 + copies, F) in each copy of the
     # episode; None when the agent does not use it
     state: jax.Array | None = None  # (E, *state_shape), or features as of observations; None but for asymmetric critics
+    intended: jax.Array | None = None  # as previous_action: what was meant in its place; None unless it is imitated
     symmetry: jax.Array | None = None  # (E, 2) uint32, the same in all steps of an episode: see `mijax.augmentation`
 
 

@@ -52,6 +52,7 @@ class Tokens:
     z_s: jax.Array | None  # (R, L, F) phi(s_t), or None when the agent does not use it
     states: jax.Array | None = None  # (R L, *state_shape) for asymmetric critics
     symmetry: jax.Array | None = None  # (R, L, 2) uint32, while frames are moments: see `mijax.augmentation`
+    intended: jax.Array | None = None  # (R, L, A) what was meant in the place of the previous action; None: not wanted
     demonstrated: jax.Array | None = None  # (R, L) bool, whether an expert acted in the episode; None: not wanted
     succeeded: jax.Array | None = None  # (R, L) bool, whether it returns what an expert's does; None: not wanted
 

@@ -297,6 +297,10 @@ def _resetting(where: int):
         jax.tree.map(lambda x: jnp.zeros((number, 51, *x.shape), x.dtype), self.reset(key)[0]),
         jnp.zeros((number, 49), jnp.int32), jnp.zeros(number, jnp.int32), jnp.zeros(number, bool))),
      r"action of demonstrations is 'int32\[2, 49\]', expected int32\[2, 50\]"),
+    (_with(demonstrations=lambda self, key, number: Demonstrations(
+        jax.tree.map(lambda x: jnp.zeros((number, 51, *x.shape), x.dtype), self.reset(key)[0]),
+        jnp.zeros((number, 50), jnp.int32), jnp.zeros(number, jnp.int32), jnp.zeros(number, bool),
+        jnp.zeros((number, 50)))), r"intended of demonstrations is 'float32\[2, 50\]', expected int32\[2, 50\]"),
     (_with(step=lambda self, key, env_state, action: 1 if action > 0 else 2), "step cannot be traced by JAX: Tracer"),
 ])
 @pytest.mark.lenient

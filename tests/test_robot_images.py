@@ -16,7 +16,7 @@ from scipy.ndimage import affine_transform
 
 from envs_mjx import registry
 from envs_mjx.robot import BlockPulling, depth, noise, scene
-from envs_mjx.robot.rotation import rotate_action
+from envs_mjx.robot.rotation import mirror_action, mirror_poses, rotate_action
 from envs_mjx.robot.task import RobotState, RobotTask
 
 DOMAINS = ("block_pulling", "block_pushing", "drawer_opening")
@@ -229,20 +229,44 @@ def test_any_turn_is_that_of_the_scene(env: RobotTask, angle: float) -> None:
         np.testing.assert_allclose(got[..., channel][sure], expected[..., channel][sure], atol=1e-4)
 
 
+def test_mirroring_the_scene_flips_the_image(env: RobotTask) -> None:
+    """Exactly, as a pixel's middle is mirrored onto another's."""
+    env_state = moved(jax.tree.map(lambda x: x[0], resets(env, 1)), (0.53, 0.02, 0.15, 0.4))
+    for image, expected in zip(env.render(env_state), env.render(env.mirror(env_state)), strict=True):
+        assert (np.abs(np.asarray(image)[:, ::-1] - expected) > 1e-5).mean() < 5e-4
+
+
+def test_a_mirrored_step_is_the_step_of_the_mirrored(env: RobotTask) -> None:
+    """Free motion and contact: the gripper goes down onto an object and drags it."""
+    start = jax.tree.map(lambda x: x[0], resets(env, 1))
+    x, y, yaw = np.asarray(env.object_poses(start))[int(start.movable)]
+    start = moved(start, (float(x), float(y) + 0.01, env.plan.work + 0.04, float(yaw)))
+    step = jax.jit(lambda env_state, action: env.step(jax.random.key(0), env_state, action)[0])
+    there, back = start, env.mirror(start)
+    for action in ([0.0, 0.0, -0.8, 0.0], [0.4, 0.5, 0.0, 0.2], [0.4, 0.5, 0.0, 0.2]):
+        there, back = step(there, jnp.array(action)), step(back, mirror_action(jnp.array(action)))
+    assert bool(there.touched)
+    np.testing.assert_allclose(env.mirror(there).qpos, back.qpos, atol=2e-3)
+
+
 def test_augmenting_turns_moments_and_actions_alike(env: RobotTask) -> None:
-    """One key, one turn: places and actions by the same angle, and the objects stay sorted as they are drawn."""
+    """One key, one motion: places and actions alike, about half of them mirrored before; the objects stay sorted."""
     states = jax.tree.map(lambda x: x[:16], resets(env, 64))
     action = jnp.array([0.3, 0.4, -0.3, 0.9])
     keys = jax.random.split(jax.random.key(0), 16)
     moved_states, actions = jax.vmap(env.augment, (0, 0, None))(keys, states, action)
-    angle = np.asarray(moved_states.qpos[:, 3] - states.qpos[:, 3])
+    mirrored = np.asarray(actions)[:, 3] < 0
+    assert 0 < mirrored.sum() < 16
+    angle = np.asarray(moved_states.qpos)[:, 3] - np.where(mirrored, -1, 1) * np.asarray(states.qpos)[:, 3]
     assert np.ptp(angle) > 1
     for index in range(16):
-        np.testing.assert_allclose(actions[index], rotate_action(action, jnp.float32(angle[index])), atol=1e-6)
+        before = mirror_action(action) if mirrored[index] else action
+        np.testing.assert_allclose(actions[index], rotate_action(before, jnp.float32(angle[index])), atol=1e-6)
     cos, sin = np.cos(angle), np.sin(angle)
     matrix = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
     loose, loose_moved = (np.take_along_axis(np.asarray(s.poses), np.asarray(s.movable)[:, None, None], axis=1)[:, 0]
                           for s in (states, moved_states))
+    loose = np.where(mirrored[:, None], mirror_poses(jnp.asarray(loose)), loose)
     middle = scene.CENTRE[None]
     expected = np.einsum("nij,nj->ni", matrix, loose[:, :2] - middle) + middle
     np.testing.assert_allclose(loose_moved[:, :2], expected, atol=1e-6)

@@ -176,13 +176,15 @@ def test_losses_by_hand_with_imitation(successes: bool):
     """The first and the last episode are an expert's; the mean may imitate the second one too."""
     case = Case("base", sac=dataclasses.replace(IMITATING, bootstrap_at_time_limit=False, trace_decay=0.0))
     second = case.tokens.segment == 2
-    case.tokens = dataclasses.replace(case.tokens, demonstrated=~second, succeeded=second if successes else None)
+    meant = jax.random.uniform(jax.random.key(7), case.tokens.previous_action.shape, minval=-1.0)
+    case.tokens = dataclasses.replace(
+        case.tokens, intended=meant, demonstrated=~second, succeeded=second if successes else None)
     expected, taken = losses_by_loops(case, np.zeros((2, ROW))), taken_actions(case)
     mean, log_scale, _, _ = case.says(case.params, case.tokens, taken)
 
     def distances(*spans: tuple[int, int, int]) -> np.ndarray:
-        """Of the mean to each coordinate of the actions taken."""
-        return np.array([np.tanh(mean[row, t]) - taken[row, t] for row, first, end in spans
+        """Of the mean to each coordinate of the actions that were meant."""
+        return np.array([np.tanh(mean[row, t]) - meant[row, t + 1] for row, first, end in spans
                          for t in range(first, end - 1)])
 
     moves = distances(SPANS[0], SPANS[2])
@@ -449,6 +451,30 @@ def test_a_sampled_copy_is_turned_as_a_whole(ours: tuple[Run, LearnerState]):
         np.testing.assert_allclose(tokens.z_s[row, :length], labels, atol=1e-4)
     assert 0.0 in [x % 6.283 for x in angles]
     assert 2 < len(set(angles)) <= 4
+
+
+class Slipping(Compass):
+    """Whose expert means half of what it does."""
+
+    def demonstrations(self, key: jax.Array, number: int) -> Demonstrations:
+        shown = super().demonstrations(key, number)
+        return dataclasses.replace(shown, intended=shown.action / 2)
+
+
+@pytest.mark.lenient
+@pytest.mark.parametrize("trunk", ["shared", "psi"])
+def test_what_an_expert_meant_is_turned_too(trunk: str):
+    """Demonstrations come with what was meant, in every copy; the agent's own episodes with what was done."""
+    config = dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, imitation_weight=1.0, trunk=trunk))
+    run = Run(config, Slipping())
+    state = run.start()
+    shown, own = (jnp.broadcast_to(state.replay.finished[place], (4,)) for place in (0, LOOP.sac.demonstrations))
+    slots = jnp.concatenate([shown, own])
+    tokens = jax.jit(lambda: run.learner._read(state.replay, slots, one_per_row(8), 8, jax.random.key(4)))()
+    half = np.where(np.asarray(tokens.demonstrated), 0.5, 1.0)[..., None]
+    assert 0 < np.count_nonzero(half == 0.5) < half.size
+    np.testing.assert_allclose(np.asarray(tokens.intended), half * np.asarray(tokens.previous_action), atol=1e-6)
+    assert len(np.unique(np.round(np.asarray(tokens.previous_action)[:4, 1, 0], 3))) > 1
 
 
 @pytest.mark.lenient

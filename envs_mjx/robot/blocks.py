@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.robot import depth, scene
-from envs_mjx.robot.rotation import turn_poses, turn_vectors
+from envs_mjx.robot.rotation import mirror_poses, turn_poses, turn_vectors
 from envs_mjx.robot.task import RobotState, RobotTask, turn_common
 
 _BEHIND = 0.08
@@ -81,6 +81,13 @@ class BlockTask(RobotTask):
         return dataclasses.replace(
             turned, qpos=turned.qpos.at[4:].set(joints), qvel=turned.qvel.at[4:6].set(speeds),
             poses=turned.poses[order], movable=jnp.where(order[0] == 0, env_state.movable, 1 - env_state.movable))
+
+    def mirror(self, env_state: RobotState) -> RobotState:
+        """Mirrored in the plane of the workspace's middle y."""
+        mirrored = super().mirror(env_state)
+        return dataclasses.replace(
+            mirrored, qpos=mirrored.qpos.at[4:].set(mirror_poses(env_state.qpos[4:])),
+            qvel=mirrored.qvel.at[jnp.array([5, 6])].multiply(-1))
 
     def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Heights of the loose block, the fixed block, and the ground, each (84, 84)."""

@@ -1,7 +1,7 @@
-"""Rotation augmentation (paper Appendix F): places, vectors, poses and actions turned by an angle.
+"""Rotation augmentation (paper Appendix F): places, vectors, poses and actions turned by an angle, or mirrored.
 
-Turning by `angle` takes the world's x axis towards its y axis. `RobotTask.augment` turns a whole scene and renders it
-again; no image is turned.
+Turning by `angle` takes the world's x axis towards its y axis; mirroring changes y and yaw (not in
+the paper). `RobotTask.augment` moves a whole scene and renders it again; no image is turned.
 """
 
 import jax
@@ -19,6 +19,16 @@ def random_angle(key: jax.Array) -> jax.Array:
 def rotate_action(action: jax.Array, angle: jax.Array) -> jax.Array:
     """Turn (dx, dy) of an action (4,) by `angle` () and clip them to [-1, 1]; dz and the gripper's turn stay."""
     return jnp.concatenate([jnp.clip(turn_vectors(action[:2], angle), -1.0, 1.0), action[2:]])
+
+
+def mirror_action(action: jax.Array) -> jax.Array:
+    """An action (4,) with dy and the gripper's turn the other way."""
+    return action * jnp.array([1.0, -1.0, 1.0, -1.0])
+
+
+def mirror_poses(poses: jax.Array) -> jax.Array:
+    """(..., 3) x, y, yaw mirrored in the plane of the workspace's middle y."""
+    return poses.at[..., 1].set(2 * scene.CENTRE[1] - poses[..., 1]).at[..., 2].multiply(-1)
 
 
 def turn_poses(poses: jax.Array, angle: jax.Array) -> jax.Array:

@@ -81,10 +81,15 @@ class RobotTask(Environment):
     """How the scripted expert works; `stroke` says where."""
     expert_noise = 0.0
     """Standard deviation of what is added to the actions of demonstrations, in fractions of the largest action."""
+    expert_slips = 0.0
+    """Probability, at every step of demonstrations, that the expert slips."""
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 
-    def __init__(self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None) -> None:
+    def __init__(
+        self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None,
+        expert_slips: float | None = None,
+    ) -> None:
         """Options that make a policy fit for a robot.
 
         Args:
@@ -93,16 +98,21 @@ class RobotTask(Environment):
                 with 0. The gripper's height has 2 500 N/m: 12.5 stops it 5 mm too deep. 0: never.
             expert_noise: replaces the task's own, if given. With some, demonstrations show what to do after a small
                 error and after an attempt that failed.
+            expert_slips: replaces the task's own, if given. With some, demonstrations show how to begin again from
+                anywhere (`planner.Planner`).
 
         Raises:
-            ValueError: for a negative number.
+            ValueError: for a negative number, or a probability above 1.
         """
-        if min(noise, stop_force, expert_noise or 0.0) < 0:
+        if min(noise, stop_force, expert_noise or 0.0, expert_slips or 0.0) < 0 or (expert_slips or 0.0) > 1:
             raise ValueError(
-                f"noise {noise}, stop_force {stop_force}, expert_noise {expert_noise}: expected numbers >= 0")
+                f"noise {noise}, stop_force {stop_force}, expert_noise {expert_noise}, expert_slips {expert_slips}: "
+                "expected numbers >= 0, expert_slips <= 1")
         self.noise, self.stop_force = noise, stop_force
         if expert_noise is not None:
             self.expert_noise = expert_noise
+        if expert_slips is not None:
+            self.expert_slips = expert_slips
         self.physics = scene.Physics(self.xml(), self.placed)
 
     placed: Sequence[str]
@@ -153,6 +163,15 @@ class RobotTask(Environment):
     @abc.abstractmethod
     def turn(self, env_state: RobotState, angle: jax.Array) -> RobotState:
         """The whole scene turned by `angle` () about the middle of the workspace; `turn_common` does what all share."""
+
+    def mirror(self, env_state: RobotState) -> RobotState:
+        """The whole scene mirrored in the plane of the workspace's middle y. Default: the objects' joints stay."""
+        gripper, goal = env_state.qpos[jnp.array([0, 1, 3])], env_state.goal
+        x, y, yaw = rotation.mirror_poses(gripper)
+        return dataclasses.replace(
+            env_state, qpos=env_state.qpos.at[jnp.array([0, 1, 3])].set(jnp.stack([x, y, yaw])),
+            qvel=env_state.qvel.at[jnp.array([1, 3])].multiply(-1), poses=rotation.mirror_poses(env_state.poses),
+            goal=goal.at[1].set(2 * scene.CENTRE[1] - goal[1]))
 
     def left_workspace(self, env_state: RobotState) -> jax.Array:
         """() bool: whether the movable object is out of reach. Default: it cannot be."""
@@ -218,16 +237,22 @@ class RobotTask(Environment):
         from envs_mjx.robot import planner  # it builds on this module
 
         episodes = planner.demonstrations(self, key, number)
-        return Demonstrations(episodes.states, episodes.actions, episodes.length, episodes.success)
+        return Demonstrations(
+            episodes.states, episodes.actions, episodes.length, episodes.success, episodes.intended)
 
     def augment(self, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, jax.Array]:
-        """The scene and the action turned by a random angle (Appendix F), the noise in the image drawn anew.
+        """The scene and the action turned by a random angle (Appendix F), mirrored before half of the time; the noise
+        in the image drawn anew.
 
         The scene is turned and rendered again, not its image: exact, where turning pixels smooths edges, invents what
         lies beyond the border and turns the painted fingers and the pad, which stay upright in real observations.
         """
         key_angle, key_noise = jax.random.split(key)
         angle = rotation.random_angle(key_angle)
+        mirrored = jax.random.bernoulli(jax.random.fold_in(key_angle, 1))
+        before = env_state, action
+        env_state, action = jax.tree.map(lambda a, b: jnp.where(mirrored, a, b),
+                                         (self.mirror(env_state), rotation.mirror_action(action)), before)
         turned = self.turn(env_state, angle)
         noise_key = turned.noise_key ^ _noise_key(key_noise)
         return dataclasses.replace(turned, noise_key=noise_key), rotation.rotate_action(action, angle)

@@ -231,8 +231,8 @@ class SAC(Agent):
             x.reshape(*tokens.segment.shape, -1)[:, :-1] for x in self._call("policy", agent, online.actor))
         demonstrated, succeeded = (
             None if of is None else transitions(tokens) & of[:, :-1] for of in (tokens.demonstrated, tokens.succeeded))
-        return sac.imitation_loss(
-            jnp.tanh(mean), log_scale, tokens.previous_action[:, 1:], cast(jax.Array, demonstrated), succeeded)
+        intended = cast(jax.Array, tokens.intended)[:, 1:]
+        return sac.imitation_loss(jnp.tanh(mean), log_scale, intended, cast(jax.Array, demonstrated), succeeded)
 
     def _critic(
         self, agent: Params, online: Encoded, soft_value: jax.Array, bonus: jax.Array, tokens: Tokens

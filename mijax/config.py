@@ -13,6 +13,7 @@ CriticInput = Literal["state", "history_state"]
 """What an asymmetric critic sees beside the action: s, or h and s."""
 PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
 IntrinsicForm = Literal["explained_variance", "cosine"]
+LowerBound = Literal["jensen_shannon", "reconstruction"]
 DataSource = Literal["random", "demonstrations"]
 """Whose episodes stage 1 learns from: a random policy's, or those of the environment's expert."""
 TrunkKind = Literal["own", "shared", "psi"]
@@ -77,6 +78,10 @@ class Stage1Config:
     """Weight of the lower bound of I(s; z_s), which is maximised."""
     lambda_dim_o: float = 1.0
     """Weight of the lower bound of I(o; z_o), which is maximised."""
+    lower_bound: LowerBound = "jensen_shannon"
+    """Where these two bounds come from. jensen_shannon: Deep InfoMax, the paper's, which asks that frames are told
+    apart; on a camera's images the gripper's height and yaw are enough for that, and z_o holds little else.
+    reconstruction: a decoder draws o from z_o, and s from z_s and z_o together, z_o constant."""
     estimator_updates: int = 5
     """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
     lambda_kl: float = 0.0

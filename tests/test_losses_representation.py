@@ -8,6 +8,7 @@ import pytest
 from mijax.losses.club import club_all_pairs, club_sampled, gaussian_fit, gaussian_log_density
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
+from mijax.losses.reconstruction import reconstruction_loss
 
 
 def _random(*shape: int, seed: int = 0) -> np.ndarray:
@@ -140,3 +141,28 @@ def test_reward_loss_is_the_mean_square():
 def test_wrong_shapes_are_errors_and_never_broadcast(call):
     with pytest.raises(AssertionError):
         call()
+
+
+def test_reconstruction_is_the_variance_left_over() -> None:
+    rng = np.random.default_rng(0)
+    target, drawn = rng.normal(size=(2, 7, 5)).astype(np.float32)
+    weight = rng.dirichlet(np.ones(7)).astype(np.float32)
+    mean = sum(w * x for w, x in zip(weight, target, strict=True))
+    error = sum(w * np.sum((x - y) ** 2) for w, x, y in zip(weight, target, drawn, strict=True))
+    variance = sum(w * np.sum((x - mean) ** 2) for w, x in zip(weight, target, strict=True))
+    np.testing.assert_allclose(
+        reconstruction_loss(*map(jnp.asarray, (drawn, target, weight)))[0], error / variance, rtol=1e-5)
+    constant = jnp.broadcast_to(target.mean(0), target.shape)
+    np.testing.assert_allclose(reconstruction_loss(constant, jnp.asarray(target))[0], 1, rtol=1e-5)
+    assert float(reconstruction_loss(jnp.asarray(target), jnp.asarray(target))[0]) == 0
+
+
+@pytest.mark.parametrize("correlation", [0.3, 0.9, 0.999])
+def test_reconstruction_bounds_the_information_of_gaussians_tightly(correlation: float) -> None:
+    """x and z of D independent pairs: the best drawing is their regression, and D / 2 log(1 / loss) is I(x; z)."""
+    size, rows = 3, 200_000
+    z, noise = np.random.default_rng(0).normal(size=(2, rows, size)).astype(np.float32)
+    x = correlation * z + np.sqrt(1 - correlation**2) * noise
+    loss = float(reconstruction_loss(jnp.asarray(correlation * z), jnp.asarray(x))[0])
+    information = -size / 2 * np.log(1 - correlation**2)
+    np.testing.assert_allclose(size / 2 * np.log(1 / loss), information, atol=0.02)

@@ -295,9 +295,8 @@ def test_changing_over() -> None:
         assert ups == [False] * patience + [changes_over] * 2 + [False]
 
 
-@pytest.fixture
-def untouched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawers whose gripper goes where it is told and touches nothing."""
+def test_a_shaky_expert_sees_where_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside what was done is what the expert meant to do in the recorded states. Nothing is touched."""
     def step(env: RobotTask, key: jax.Array, env_state: RobotState, action: jax.Array) -> tuple[RobotState, None]:
         moved = env_state.qpos.at[:4].set(scene.target_of(env_state.qpos, action))
         time = env_state.time + 1
@@ -305,11 +304,6 @@ def untouched(monkeypatch: pytest.MonkeyPatch) -> None:
         return dataclasses.replace(env_state, qpos=moved, time=time, outcome=outcome), None
 
     monkeypatch.setattr(DrawerOpening, "step", step)
-
-
-@pytest.mark.usefixtures("untouched")
-def test_a_shaky_expert_sees_where_it_went() -> None:
-    """What is recorded is the expert's action in the recorded states, and beside it what was done: with noise."""
     env, noise = DrawerOpening(expert_noise=0.1), 0.1
     shown = jax.jit(lambda key: demonstrations(env, key, 32))(jax.random.key(0))
     same = jax.jit(lambda key: jax.lax.map(Planner(env, noise=noise).play, jax.random.split(key, 48), batch_size=16))
@@ -333,29 +327,10 @@ def test_a_shaky_expert_sees_where_it_went() -> None:
     assert np.abs(shown.actions).max() <= 1
 
 
-@pytest.mark.usefixtures("untouched")
-def test_an_expert_that_slips_begins_again() -> None:
-    """A slip is one random action for three steps; from its first on the expert means to hover above its object."""
-    env, slips = DrawerOpening(expert_noise=0.0, expert_slips=0.1), 0.1
-    shown = jax.device_get(jax.jit(lambda key: demonstrations(env, key, 64))(jax.random.key(0)))
-    slipped = np.abs(shown.actions - shown.intended).max(axis=-1) > 0
-    assert slipped.mean() == pytest.approx(3 * slips / (3 * slips + 1 - slips), rel=0.1)
-    new = slipped & ~np.pad(slipped, ((0, 0), (1, 0)))[:, :-1]  # the first step of a slip that follows none
-    episode, time = (index[np.nonzero(new)[1] < env.horizon - 2] for index in np.nonzero(new))
-    assert len(time) > 100
-    for later in (1, 2):
-        np.testing.assert_array_equal(shown.actions[episode, time], shown.actions[episode, time + later])
-    height = shown.states.qpos[episode, time, 2]
-    up = np.clip((env.plan.hover - height) / scene.ACTION_SCALE[2], -1, 1)
-    np.testing.assert_allclose(shown.intended[episode, time, 2], up, atol=1e-5)
-
-
 def test_arguments_of_a_task() -> None:
     assert registry.make("block_pushing,stop_force=12.5,noise=0.007").stop_force == 12.5  # pyright: ignore
     with pytest.raises(registry.UnknownDomain, match="expected numbers >= 0"):
         registry.make("block_pushing,expert_noise=-1")
-    with pytest.raises(registry.UnknownDomain, match="expert_slips <= 1"):
-        registry.make("block_pushing,expert_slips=2")
 
 
 @pytest.mark.slow

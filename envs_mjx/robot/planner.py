@@ -5,8 +5,6 @@ pushes. When the object does not move for a while, it changes over to the other 
 object is movable. Lengths in metres, angles in radians.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -21,8 +19,6 @@ _MOVED = 0.003
 _BATCH = 16
 """Episodes side by side: the fastest on a CPU."""
 _RETREAT_STEPS = 2
-_SLIP_STEPS = 3
-"""Up to 15 cm and 0.9 rad: far enough that the work has to be begun again."""
 
 
 @struct.dataclass
@@ -35,19 +31,6 @@ class PlannerState:
     retreating: jax.Array  # () int32, steps of retreat that are left
     seen: jax.Array  # (2, 2) where the objects were before the last action
 
-    def again(self) -> "PlannerState":
-        """About to begin with the same object again."""
-        zero = jnp.zeros((), jnp.int32)
-        return dataclasses.replace(self, stage=zero, stuck=zero, retreating=zero)
-
-
-@struct.dataclass
-class Slip:
-    """What leads the hand astray."""
-
-    left: jax.Array  # () int32, steps that are left of it, this one included
-    action: jax.Array  # (4,) what is done in each of them
-
 
 @struct.dataclass
 class Trajectory:
@@ -55,7 +38,7 @@ class Trajectory:
 
     states: RobotState  # leading axis T + 1
     actions: jax.Array  # (T, 4) what was done
-    intended: jax.Array  # (T, 4) what the expert meant to do, without noise and slips
+    intended: jax.Array  # (T, 4) what the expert meant to do, without noise
     length: jax.Array  # () int32, steps of the episode
     outcome: jax.Array  # () int32, how it ended: an index into `task.OUTCOMES`
     first: jax.Array  # () int32, the object that was chosen first
@@ -69,9 +52,7 @@ class Trajectory:
 class Planner:
     """The expert of a task. `act` is a pure function."""
 
-    def __init__(
-        self, env: RobotTask, changes_over: bool = True, noise: float = 0.0, slips: float = 0.0
-    ) -> None:
+    def __init__(self, env: RobotTask, changes_over: bool = True, noise: float = 0.0) -> None:
         """How the expert works.
 
         Args:
@@ -79,13 +60,10 @@ class Planner:
             changes_over: False gives one that works on its first choice for ever, for comparison.
             noise: standard deviation of what is added to its actions in `play`, in fractions of the largest action. It
                 sees what comes of it and makes it good.
-            slips: probability, at every step of `play`, of a slip: three steps in one random direction, after which it
-                begins its work on the same object again.
         """
         self.env = env
         self.changes_over = changes_over
         self.noise = noise
-        self.slips = slips
 
     def start(self, key: jax.Array, env_state: RobotState) -> PlannerState:
         """Choose an object at random."""
@@ -139,33 +117,20 @@ class Planner:
             planner = self.start_with(jnp.where(first == 1, env_state.movable, 1 - env_state.movable), env_state)
 
         def step(carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
-            env_state, planner, slip = carry
-            if self.slips:
-                slip, begins = self._slip(slip, jax.random.fold_in(key, 2))
-                planner = jax.tree.map(lambda a, b: jnp.where(begins, a, b), planner.again(), planner)
+            env_state, planner = carry
             intended, planner = self.act(planner, env_state)
             action = intended
             if self.noise:
                 noise = self.noise * jax.random.normal(jax.random.fold_in(key, 1), action.shape)
                 action = jnp.clip(action + noise, -1.0, 1.0)
-            action = jnp.where(slip.left > 0, slip.action, action)
             env_state, _ = self.env.step(key, env_state, action)
-            return (env_state, planner, slip), (env_state, action, intended)
+            return (env_state, planner), (env_state, action, intended)
 
-        none = Slip(jnp.zeros((), jnp.int32), jnp.zeros_like(scene.ACTION_SCALE))
         keys = jax.random.split(key_steps, self.env.horizon)
-        _, (later, actions, intended) = jax.lax.scan(step, (env_state, planner, none), keys)
+        _, (later, actions, intended) = jax.lax.scan(step, (env_state, planner), keys)
         states = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), env_state, later)
         end = jnp.argmax(states.outcome != RUNNING).astype(jnp.int32)
         return Trajectory(states, actions, intended, end, states.outcome[end], planner.chosen)
-
-    def _slip(self, slip: Slip, key: jax.Array) -> tuple[Slip, jax.Array]:
-        """The slip one step later, and () bool whether a new one begins."""
-        key_begins, key_action = jax.random.split(key)
-        begins = (slip.left <= 1) & jax.random.bernoulli(key_begins, self.slips)
-        action = jax.random.uniform(key_action, slip.action.shape, minval=-1.0, maxval=1.0)
-        left = jnp.where(begins, _SLIP_STEPS, jnp.maximum(slip.left - 1, 0))
-        return Slip(left, jnp.where(begins, action, slip.action)), begins
 
 
 def demonstrations(env: RobotTask, key: jax.Array, number: int = 80, spare: float = 0.25) -> Trajectory:
@@ -179,8 +144,7 @@ def demonstrations(env: RobotTask, key: jax.Array, number: int = 80, spare: floa
     """
     played = -(-(number + int(number * spare)) // _BATCH) * _BATCH  # whole batches: a partial one is compiled by itself
     keys = jax.random.split(key, played)
-    planner = Planner(env, noise=env.expert_noise, slips=env.expert_slips)
-    episodes = jax.lax.map(planner.play, keys, batch_size=_BATCH)
+    episodes = jax.lax.map(Planner(env, noise=env.expert_noise).play, keys, batch_size=_BATCH)
     order = jnp.argsort(~episodes.success, stable=True)[:number]
     return jax.tree.map(lambda x: x[order], episodes)
 

@@ -81,15 +81,10 @@ class RobotTask(Environment):
     """How the scripted expert works; `stroke` says where."""
     expert_noise = 0.0
     """Standard deviation of what is added to the actions of demonstrations, in fractions of the largest action."""
-    expert_slips = 0.0
-    """Probability, at every step of demonstrations, that the expert slips."""
     variables = (Variable("movable", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
 
-    def __init__(
-        self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None,
-        expert_slips: float | None = None,
-    ) -> None:
+    def __init__(self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None) -> None:
         """Options that make a policy fit for a robot.
 
         Args:
@@ -98,21 +93,16 @@ class RobotTask(Environment):
                 with 0. The gripper's height has 2 500 N/m: 12.5 stops it 5 mm too deep. 0: never.
             expert_noise: replaces the task's own, if given. With some, demonstrations show what to do after a small
                 error and after an attempt that failed.
-            expert_slips: replaces the task's own, if given. With some, demonstrations show how to begin again from
-                anywhere (`planner.Planner`).
 
         Raises:
-            ValueError: for a negative number, or a probability above 1.
+            ValueError: for a negative number.
         """
-        if min(noise, stop_force, expert_noise or 0.0, expert_slips or 0.0) < 0 or (expert_slips or 0.0) > 1:
+        if min(noise, stop_force, expert_noise or 0.0) < 0:
             raise ValueError(
-                f"noise {noise}, stop_force {stop_force}, expert_noise {expert_noise}, expert_slips {expert_slips}: "
-                "expected numbers >= 0, expert_slips <= 1")
+                f"noise {noise}, stop_force {stop_force}, expert_noise {expert_noise}: expected numbers >= 0")
         self.noise, self.stop_force = noise, stop_force
         if expert_noise is not None:
             self.expert_noise = expert_noise
-        if expert_slips is not None:
-            self.expert_slips = expert_slips
         self.physics = scene.Physics(self.xml(), self.placed)
 
     placed: Sequence[str]

@@ -12,6 +12,7 @@ from mijax.losses.information import (
     prediction_mse,
 )
 from mijax.losses.masks import masked_mean
+from mijax.losses.reconstruction import reconstruction_loss
 from mijax.losses.returns import traced_returns
 from mijax.losses.sac import actor_loss, critic_loss, imitation_loss, sample_tanh_gaussian, temperature_loss
 from mijax.losses.td import double_q_value, td_loss
@@ -35,6 +36,7 @@ __all__ = [
     "next_feature_loss",
     "prediction_cosine",
     "prediction_mse",
+    "reconstruction_loss",
     "reward_loss",
     "sample_tanh_gaussian",
     "td_loss",

@@ -24,6 +24,7 @@ from mijax.losses.belief import kl_standard_normal
 from mijax.losses.club import club_all_pairs, gaussian_fit
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
+from mijax.losses.reconstruction import reconstruction_loss
 from mijax.nets.encoders import Encoder
 from mijax.representation.dataset import Transitions, collect
 from mijax.representation.model import evaluate, init_parameters, local_features
@@ -199,7 +200,7 @@ def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
 def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> Features:
     """z_s, z_o, their successors (constants), and what the discriminators say of the inputs: (B, F) each."""
     networks, config, rows, shown = problem.networks, problem.config, batch.rows, batch.shown
-    each = jnp.arange(rows.size, dtype=jnp.int32)
+    each, tells_apart = jnp.arange(rows.size, dtype=jnp.int32), config.lower_bound == "jensen_shannon"
 
     def both(encoder: Encoder, now: tuple[Frames, jax.Array], after: tuple[Frames, jax.Array], name: str,
              discriminator: str | None) -> tuple[jax.Array, jax.Array, jax.Array | None]:
@@ -223,9 +224,9 @@ def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> F
         s, next_s = (shown.state, each), (shown.next_state, each)
         o, next_o = (shown.observation, each), (shown.next_observation, each)
     z_s, next_z_s, local_s = both(
-        networks.phi, s, next_s, "phi", "discriminator_s" if config.lambda_dim_s > 0 else None)
+        networks.phi, s, next_s, "phi", "discriminator_s" if tells_apart and config.lambda_dim_s > 0 else None)
     z_o, next_z_o, local_o = both(
-        networks.psi, o, next_o, "psi", "discriminator_o" if config.lambda_dim_o > 0 else None)
+        networks.psi, o, next_o, "psi", "discriminator_o" if tells_apart and config.lambda_dim_o > 0 else None)
     return Features(z_s=z_s, z_o=z_o, next_z_s=next_z_s, next_z_o=next_z_o, local_s=local_s, local_o=local_o)
 
 
@@ -267,8 +268,25 @@ def encoder_loss(
         terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, s, weight)
     if f.local_o is not None:
         terms["dim_o_loss"] = weights.lambda_dim_o, dim_loss(f.z_o, f.local_o, o, weight)
+    if problem.config.lower_bound == "reconstruction":
+        terms |= reconstruction(parameters, problem, weights, batch, f)
     total = sum((scale * value for scale, value in terms.values()), jnp.zeros((), jnp.float32))
     return total, (fit, {"loss": total} | {name: value for name, (_, value) in terms.items()})
+
+
+def reconstruction(
+    parameters: dict[str, Params], problem: Problem, weights: LossWeights, batch: Batch, f: Features
+) -> dict[str, tuple[Weight, jax.Array]]:
+    """The terms that stand in the place of DIM's: o drawn from z_o, and s from z_s and a constant z_o, so that z_s is
+    asked for no more of s than z_o leaves open."""
+    networks, rows, shown = problem.networks, batch.rows, batch.shown
+    both = jnp.concatenate([f.z_s, jax.lax.stop_gradient(f.z_o)], axis=-1)
+    states = problem.data.states[rows.state] if shown is None else shown.state
+    observations = problem.data.observations[rows.observation] if shown is None else shown.observation
+    of_s = networks.draw(parameters["discriminator_s"], both, states, networks.state_spec)
+    of_o = networks.draw(parameters["discriminator_o"], f.z_o, observations, networks.observation_spec)
+    return {"drawn_s_loss": (weights.lambda_dim_s, reconstruction_loss(*of_s, batch.weight)[0]),
+            "drawn_o_loss": (weights.lambda_dim_o, reconstruction_loss(*of_o, batch.weight)[0])}
 
 
 def fit_estimator(
@@ -291,7 +309,9 @@ def fit_estimator(
 
 def initial_state(problem: Problem, key: jax.Array) -> TrainState:
     """Fresh parameters and optimisers."""
-    parameters = init_parameters(problem.networks, key, problem.data.states[:1], problem.data.observations[:1])
+    parameters = init_parameters(
+        problem.networks, key, problem.data.states[:1], problem.data.observations[:1],
+        lower_bound=problem.config.lower_bound)
     estimator = parameters.pop("estimator")
     optimizer, estimator_optimizer = optimizers(problem.config, 1, 0.0)
     return TrainState(

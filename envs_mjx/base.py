@@ -62,8 +62,8 @@ class ArraySpec:
     blank: int = 0
     """Trailing channels of an image that are always 0: learners may leave them out of what they store and encode."""
     contrast: float = 0.0
-    """The difference between two pixels that matters, of a depth image whose level does not: phi and psi see it above
-    the greatest depth of its first channel, in this unit. 0: they see it as it is."""
+    """The difference between two pixels that matters, of an image whose level does not: phi and psi see it relative to
+    the mean of its first channel, in this unit. 0: they see it as it is."""
 
     @property
     def is_image(self) -> bool:

@@ -79,9 +79,9 @@ class Stage1Config:
     lambda_dim_o: float = 1.0
     """Weight of the lower bound of I(o; z_o), which is maximised."""
     lower_bound: LowerBound = "jensen_shannon"
-    """Where these two bounds come from. jensen_shannon: Deep InfoMax, the paper's, which asks that frames are told
-    apart; on a camera's images the gripper's height and yaw are enough for that, and z_o holds little else.
-    reconstruction: a decoder draws o from z_o, and s from z_s and z_o together, z_o constant."""
+    """Where the bound of I(o; z_o) comes from. jensen_shannon: Deep InfoMax, the paper's, which asks that observations
+    are told apart; on a camera's images the gripper's height and yaw are enough for that, whatever else they show.
+    reconstruction: a decoder draws o from z_o."""
     estimator_updates: int = 5
     """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
     lambda_kl: float = 0.0

@@ -21,16 +21,7 @@ from mijax.representation.model import drawn, evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
 from mijax.representation.problem import Problem
 from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
-from mijax.representation.train import (
-    EstimatorState,
-    LossWeights,
-    club_growth,
-    encode,
-    features,
-    initial_state,
-    reconstruction,
-    shrink,
-)
+from mijax.representation.train import EstimatorState, club_growth, encode, shrink
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
 
@@ -108,7 +99,7 @@ def test_contrast_hides_the_level_of_an_image():
     params = plain.init(jax.random.key(0), x)["params"]
     seen = evaluate(relative, params, x)
     np.testing.assert_allclose(evaluate(relative, params, x + 0.3), seen, rtol=1e-3, atol=1e-3)
-    by_hand = (np.asarray(x) - np.asarray(x[..., 0]).max((1, 2))[:, None, None, None]) / 0.05
+    by_hand = (np.asarray(x) - np.asarray(x[..., 0]).mean((1, 2))[:, None, None, None]) / 0.05
     np.testing.assert_allclose(evaluate(plain, params, jnp.asarray(by_hand)), seen, rtol=1e-3, atol=1e-3)
 
 
@@ -162,31 +153,23 @@ def test_training_tells_observations_apart_and_predicts(env):
 
 
 @pytest.mark.lenient
-def test_training_draws_frames(env):
-    """Observations from z_o; states from z_s, which is not asked for what z_o says: no gradient reaches psi."""
-    config = dataclasses.replace(SMALL, lower_bound="reconstruction", epochs=60, learning_rate=3e-3)
-    _, history = learn_representation(env, config, jax.random.key(0))
-    for name in ("drawn_s_loss", "drawn_o_loss"):
-        first, last = history.metrics[name][[0, -1]]
-        assert last < 0.5 * first < 1, name
-    problem = Problem.of(env, config, collect(env, jax.random.key(3), config.episodes))
-    batch = problem.batch(jnp.arange(config.batch_size), jax.random.key(0))
-
-    def drawn_s(parameters: dict[str, Any]) -> jax.Array:
-        f = features(problem, parameters, batch)
-        return reconstruction(parameters, problem, LossWeights.of(config), batch, f)["drawn_s_loss"][1]
-
-    gradient = jax.jit(jax.grad(drawn_s))(initial_state(problem, jax.random.key(1)).parameters)
-    moved = {name for name, tree in gradient.items() if any(np.any(np.asarray(x)) for x in jax.tree.leaves(tree))}
-    assert moved == {"phi", "discriminator_s"}
+@pytest.mark.parametrize("name", ["heaven_hell", "sphinx"])
+def test_training_draws_observations(name: str):
+    """Of vectors and of images that are taken apart; states are told apart as before."""
+    config = dataclasses.replace(SMALL, lower_bound="reconstruction", epochs=40, learning_rate=3e-3)
+    _, history = learn_representation(registry.make(name), config, jax.random.key(0))
+    first, last = history.metrics["drawn_o_loss"][[0, -1]]
+    assert last < 0.5 * first < 1
+    assert "dim_o_loss" not in history.metrics
+    assert "dim_s_loss" in history.metrics
 
 
 def test_what_a_decoder_is_to_draw_of_an_image():
-    """Cells of 4 x 4 pixels, above the ground, without the blank channel."""
+    """Cells of 4 x 4 pixels, about the mean, without the blank channel."""
     spec = ArraySpec((84, 84, 2), blank=1, contrast=0.05)
     x = np.random.default_rng(0).normal(size=(2, 84, 84, 2)).astype(np.float32)
     got = np.asarray(drawn(jnp.asarray(x), spec)).reshape(2, 21, 21)
-    cell = (x[1, 8:12, 80:84, 0].mean() - x[1, ..., 0].max()) / 0.05
+    cell = (x[1, 8:12, 80:84, 0].mean() - x[1, ..., 0].mean()) / 0.05
     np.testing.assert_allclose(got[1, 2, 20], cell, rtol=1e-4)
     vector = jnp.arange(6, dtype=jnp.uint8).reshape(2, 3)
     np.testing.assert_array_equal(drawn(vector, ArraySpec((3,), np.uint8)), vector)

@@ -86,9 +86,9 @@ def _max_pool(x: jax.Array, size: int) -> jax.Array:
     return functools.reduce(jnp.maximum, shifts)
 
 
-def above_ground(x: jax.Array, contrast: float) -> jax.Array:
-    """(..., rows, columns, channels) depths relative to the greatest of the first channel, in units of `contrast`."""
-    return (x - jnp.max(x[..., :1], axis=(-3, -2, -1), keepdims=True)) / contrast
+def about_mean(x: jax.Array, contrast: float) -> jax.Array:
+    """(..., rows, columns, channels) pixels relative to the mean of the first channel, in units of `contrast`."""
+    return (x - jnp.mean(x[..., :1], axis=(-3, -2, -1), keepdims=True)) / contrast
 
 
 class VectorEncoder(nn.Module):
@@ -154,7 +154,7 @@ class ImageEncoder(nn.Module):
         """(..., rows, columns, channels) -> (..., rows', columns', channels'): what the discriminator shares."""
         if self.contrast > 0:
             assert isinstance(x, jax.Array)
-            x = above_ground(x, self.contrast)
+            x = about_mean(x, self.contrast)
         return self._block(0, x)
 
     def finish(self, h: Frames) -> jax.Array:

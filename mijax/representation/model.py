@@ -10,7 +10,7 @@ from flax import linen as nn
 from envs_mjx.base import ActionSpec, ArraySpec, DiscreteActions, Environment
 from mijax.config import LowerBound
 from mijax.frames import Frames
-from mijax.nets.encoders import Encoder, above_ground, encoder_for
+from mijax.nets.encoders import Encoder, about_mean, encoder_for
 from mijax.types import Params
 
 ACTION_WIDTH = 16
@@ -62,7 +62,7 @@ class Decoder(nn.Module):
 def drawn(frames: jax.Array, spec: ArraySpec) -> jax.Array:
     """(B, D) float32, what a decoder is to draw of (B, *shape) frames.
 
-    Vectors as they are. Images without their blank channels, depths above the ground, in cells of equally many pixels.
+    Vectors as they are. Images without their blank channels, as an encoder sees them, in cells of equally many pixels.
     """
     x = frames.astype(jnp.float32)
     if not spec.is_image:
@@ -70,7 +70,7 @@ def drawn(frames: jax.Array, spec: ArraySpec) -> jax.Array:
     rows, columns, channels = spec.shape
     side = -(-max(rows, columns) // DRAWN_CELLS)
     x = x[:, : rows // side * side, : columns // side * side, : channels - spec.blank]
-    x = above_ground(x, spec.contrast) if spec.contrast > 0 else x
+    x = about_mean(x, spec.contrast) if spec.contrast > 0 else x
     return jnp.mean(x.reshape(-1, rows // side, side, columns // side, side, x.shape[-1]), axis=(2, 4)).reshape(
         x.shape[0], -1)
 
@@ -84,13 +84,12 @@ class Networks:
     dynamics: Dynamics
     estimator: Estimator
     action_spec: ActionSpec
-    state_spec: ArraySpec
     observation_spec: ArraySpec
 
-    def draw(self, decoder: Params, z: jax.Array, frames: jax.Array, spec: ArraySpec) -> tuple[jax.Array, jax.Array]:
-        """(B, D) what a decoder draws of (B, ...) features, and what it should have drawn of the (B, *shape) frames."""
-        target = drawn(frames, spec)
-        return evaluate(Decoder(target.shape[1]), decoder, z), target
+    def draw(self, decoder: Params, z_o: jax.Array, observations: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(B, D) what a decoder draws of (B, F) features, and what it should have drawn of (B, *shape) observations."""
+        target = drawn(observations, self.observation_spec)
+        return evaluate(Decoder(target.shape[1]), decoder, z_o), target
 
     def encode_action(self, action: jax.Array) -> jax.Array:
         """(..., A) float32: discrete actions one-hot, continuous ones as they are."""
@@ -119,7 +118,7 @@ def networks_for(env: Environment, features: int) -> Networks:
     return Networks(
         phi=encoder_for(env.state_spec, features), psi=encoder_for(env.observation_spec, features),
         dynamics=Dynamics(features), estimator=Estimator(features), action_spec=env.action_spec,
-        state_spec=env.state_spec, observation_spec=env.observation_spec)
+        observation_spec=env.observation_spec)
 
 
 def init_parameters(
@@ -128,7 +127,7 @@ def init_parameters(
 ) -> dict[str, Params]:
     """Fresh parameters of all networks, by the names that `train` uses; both arrays have a leading axis.
 
-    Under `lower_bound` "reconstruction" the discriminators are decoders.
+    Under `lower_bound` "reconstruction" a decoder is in the place of the observations' discriminator.
     """
     keys = jax.random.split(key, 6)
     z = jnp.zeros((1, networks.phi.features), jnp.float32)
@@ -137,23 +136,17 @@ def init_parameters(
         h = evaluate(encoder, parameters, x, method="first_block")
         return encoder.init(init_key, h, method="finish")["params"]
 
-    def decoder(init_key: jax.Array, frames: jax.Array, spec: ArraySpec, inputs: int) -> Params:
-        size = drawn(frames, spec).shape[1]
-        return Decoder(size).init(init_key, jnp.zeros((1, inputs * networks.phi.features)))["params"]
-
     phi = networks.phi.init(keys[0], state)["params"]
     psi = networks.psi.init(keys[1], observation)["params"]
     if lower_bound == "reconstruction":
-        discriminators = (decoder(keys[2], state, networks.state_spec, 2),
-                          decoder(keys[3], observation, networks.observation_spec, 1))
+        of_o = Decoder(drawn(observation, networks.observation_spec).shape[1]).init(keys[3], z)["params"]
     else:
-        discriminators = (discriminator(networks.phi, phi, keys[2], state),
-                          discriminator(networks.psi, psi, keys[3], observation))
+        of_o = discriminator(networks.psi, psi, keys[3], observation)
     return {
         "phi": phi,
         "psi": psi,
-        "discriminator_s": discriminators[0],
-        "discriminator_o": discriminators[1],
+        "discriminator_s": discriminator(networks.phi, phi, keys[2], state),
+        "discriminator_o": of_o,
         "dynamics": networks.dynamics.init(keys[4], z, z, networks.action_like(1))["params"],
         "estimator": networks.estimator.init(keys[5], z)["params"],
     }

@@ -200,7 +200,7 @@ def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
 def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> Features:
     """z_s, z_o, their successors (constants), and what the discriminators say of the inputs: (B, F) each."""
     networks, config, rows, shown = problem.networks, problem.config, batch.rows, batch.shown
-    each, tells_apart = jnp.arange(rows.size, dtype=jnp.int32), config.lower_bound == "jensen_shannon"
+    each = jnp.arange(rows.size, dtype=jnp.int32)
 
     def both(encoder: Encoder, now: tuple[Frames, jax.Array], after: tuple[Frames, jax.Array], name: str,
              discriminator: str | None) -> tuple[jax.Array, jax.Array, jax.Array | None]:
@@ -224,9 +224,9 @@ def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> F
         s, next_s = (shown.state, each), (shown.next_state, each)
         o, next_o = (shown.observation, each), (shown.next_observation, each)
     z_s, next_z_s, local_s = both(
-        networks.phi, s, next_s, "phi", "discriminator_s" if tells_apart and config.lambda_dim_s > 0 else None)
-    z_o, next_z_o, local_o = both(
-        networks.psi, o, next_o, "psi", "discriminator_o" if tells_apart and config.lambda_dim_o > 0 else None)
+        networks.phi, s, next_s, "phi", "discriminator_s" if config.lambda_dim_s > 0 else None)
+    tells_apart = config.lower_bound == "jensen_shannon" and config.lambda_dim_o > 0
+    z_o, next_z_o, local_o = both(networks.psi, o, next_o, "psi", "discriminator_o" if tells_apart else None)
     return Features(z_s=z_s, z_o=z_o, next_z_s=next_z_s, next_z_o=next_z_o, local_s=local_s, local_o=local_o)
 
 
@@ -268,25 +268,12 @@ def encoder_loss(
         terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, s, weight)
     if f.local_o is not None:
         terms["dim_o_loss"] = weights.lambda_dim_o, dim_loss(f.z_o, f.local_o, o, weight)
-    if problem.config.lower_bound == "reconstruction":
-        terms |= reconstruction(parameters, problem, weights, batch, f)
+    if problem.config.lower_bound == "reconstruction" and problem.config.lambda_dim_o > 0:
+        frames = problem.data.observations[rows.observation] if batch.shown is None else batch.shown.observation
+        drawing = networks.draw(parameters["discriminator_o"], f.z_o, frames)
+        terms["drawn_o_loss"] = weights.lambda_dim_o, reconstruction_loss(*drawing, weight)[0]
     total = sum((scale * value for scale, value in terms.values()), jnp.zeros((), jnp.float32))
     return total, (fit, {"loss": total} | {name: value for name, (_, value) in terms.items()})
-
-
-def reconstruction(
-    parameters: dict[str, Params], problem: Problem, weights: LossWeights, batch: Batch, f: Features
-) -> dict[str, tuple[Weight, jax.Array]]:
-    """The terms that stand in the place of DIM's: o drawn from z_o, and s from z_s and a constant z_o, so that z_s is
-    asked for no more of s than z_o leaves open."""
-    networks, rows, shown = problem.networks, batch.rows, batch.shown
-    both = jnp.concatenate([f.z_s, jax.lax.stop_gradient(f.z_o)], axis=-1)
-    states = problem.data.states[rows.state] if shown is None else shown.state
-    observations = problem.data.observations[rows.observation] if shown is None else shown.observation
-    of_s = networks.draw(parameters["discriminator_s"], both, states, networks.state_spec)
-    of_o = networks.draw(parameters["discriminator_o"], f.z_o, observations, networks.observation_spec)
-    return {"drawn_s_loss": (weights.lambda_dim_s, reconstruction_loss(*of_s, batch.weight)[0]),
-            "drawn_o_loss": (weights.lambda_dim_o, reconstruction_loss(*of_o, batch.weight)[0])}
 
 
 def fit_estimator(

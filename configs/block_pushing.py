@@ -2,7 +2,7 @@
 
     python -m mijax.train --domain block_pushing
 
-Not solved: 0.47 after 12 600 steps, one seed (results/robots). Ninety minutes of one core.
+Not solved: 0.47 after 12 600 steps, one seed (results/robots). More than ninety minutes of one core.
 """
 
 from configs.robots import robot

@@ -1,13 +1,14 @@
 """What the presets of the three robot tasks share (paper Appendix B.4, Tables 2 and 3).
 
 The budget is the paper's: 800 episodes of 50 steps, 80 demonstrations of the scripted expert in the replay from the
-start, every episode sampled as it was or in one of 24 turned copies (the paper's four are learnt by heart). Updates
-are cheap: frames are looked at once, by psi's body, for every agent alike (six times the speed; on Block-Pushing the
-trunk learns), there is at most half an update for each step, with returns that reach further back, and no dropout, so
-that one pass serves gradients and targets. Every agent begins on the demonstrations alone and imitates them, less and
-less for half of the run, then a little (on Drawer-Opening always as much, and its own successes too): without, none
-learns to change over, as the critics tell a demonstration by its history and not by its actions. Stage 1 sees copies
-of each demonstrated transition as Table 3 has them, for a budget of minutes. Measurements: results/robots.
+start, every episode sampled as it was or in one of 24 turned copies, half of them mirrored (the paper's four turned
+ones are learnt by heart). Updates are cheap: frames are looked at once, by psi's body, for every agent alike (six
+times the speed; on Block-Pushing the trunk learns), there is at most half an update for each step, with returns that
+reach further back, and no dropout, so that one pass serves gradients and targets. Every agent begins on the
+demonstrations alone and imitates them, less and less for half of the run, then a little (on Drawer-Opening always as
+much, and its own successes too): without, none learns to change over, as the critics tell a demonstration by its
+history and not by its actions. Stage 1 sees copies of each demonstrated transition as Table 3 has them, for a budget
+of minutes. Measurements: results/robots.
 """
 
 from mijax.config import (

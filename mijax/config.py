@@ -51,8 +51,8 @@ class Stage1Config:
     episodes: int = 500
     """Episodes in the training set."""
     copies: int = 0
-    """Copies of every demonstrated transition, each moved by a symmetry of the task (a random turn; drawn anew in every
-    epoch) beside the original (Table 3)."""
+    """Copies of every demonstrated transition, each moved by a symmetry of the task (on the robots a random turn, half
+    of the time after mirroring; drawn anew in every epoch) beside the original (Table 3)."""
     heldout_episodes: int = 100
     """Further episodes that only the probe sees."""
     epochs: int = 200

@@ -453,7 +453,7 @@ def test_a_sampled_copy_is_turned_as_a_whole(ours: tuple[Run, LearnerState]):
     assert 2 < len(set(angles)) <= 4
 
 
-class Slipping(Compass):
+class Shaky(Compass):
     """Whose expert means half of what it does."""
 
     def demonstrations(self, key: jax.Array, number: int) -> Demonstrations:
@@ -466,7 +466,7 @@ class Slipping(Compass):
 def test_what_an_expert_meant_is_turned_too(trunk: str):
     """Demonstrations come with what was meant, in every copy; the agent's own episodes with what was done."""
     config = dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, imitation_weight=1.0, trunk=trunk))
-    run = Run(config, Slipping())
+    run = Run(config, Shaky())
     state = run.start()
     shown, own = (jnp.broadcast_to(state.replay.finished[place], (4,)) for place in (0, LOOP.sac.demonstrations))
     slots = jnp.concatenate([shown, own])

@@ -13,7 +13,7 @@ CriticInput = Literal["state", "history_state"]
 """What an asymmetric critic sees beside the action: s, or h and s."""
 PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
 IntrinsicForm = Literal["explained_variance", "cosine"]
-LowerBound = Literal["jensen_shannon", "reconstruction"]
+LowerBound = Literal["jensen_shannon", "variables"]
 DataSource = Literal["random", "demonstrations"]
 """Whose episodes stage 1 learns from: a random policy's, or those of the environment's expert."""
 TrunkKind = Literal["own", "shared", "psi"]
@@ -81,7 +81,8 @@ class Stage1Config:
     lower_bound: LowerBound = "jensen_shannon"
     """Where the bound of I(o; z_o) comes from. jensen_shannon: Deep InfoMax, the paper's, which asks that observations
     are told apart; on a camera's images the gripper's height and yaw are enough for that, whatever else they show.
-    reconstruction: a decoder draws o from z_o."""
+    variables: a linear map tells from z_o what can be seen of the domain's variables (places, angles), which a
+    simulator knows as numbers in training."""
     estimator_updates: int = 5
     """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
     lambda_kl: float = 0.0

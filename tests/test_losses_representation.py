@@ -8,7 +8,7 @@ import pytest
 from mijax.losses.club import club_all_pairs, club_sampled, gaussian_fit, gaussian_log_density
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
-from mijax.losses.reconstruction import reconstruction_loss
+from mijax.losses.variables import variables_loss
 
 
 def _random(*shape: int, seed: int = 0) -> np.ndarray:
@@ -143,26 +143,28 @@ def test_wrong_shapes_are_errors_and_never_broadcast(call):
         call()
 
 
-def test_reconstruction_is_the_variance_left_over() -> None:
+def test_variables_loss_by_hand() -> None:
+    """A real variable, one of three classes, rows of different weights; errors below the floor count as the floor."""
     rng = np.random.default_rng(0)
-    target, drawn = rng.normal(size=(2, 7, 5)).astype(np.float32)
+    guess = rng.normal(size=(7, 4)).astype(np.float32)
+    truth = np.stack([rng.normal(size=7), rng.integers(0, 3, 7)], axis=1).astype(np.float32)
     weight = rng.dirichlet(np.ones(7)).astype(np.float32)
-    mean = sum(w * x for w, x in zip(weight, target, strict=True))
-    error = sum(w * np.sum((x - y) ** 2) for w, x, y in zip(weight, target, drawn, strict=True))
-    variance = sum(w * np.sum((x - mean) ** 2) for w, x in zip(weight, target, strict=True))
+    error = sum(w * abs(y[0] - g[0]) for w, y, g in zip(weight, truth, guess, strict=True))
+    entropy = sum(w * (np.log(np.exp(g[1:]).sum()) - g[1 + int(y[1])])
+                  for w, y, g in zip(weight, truth, guess, strict=True))
+    kinds = (None, 3)
     np.testing.assert_allclose(
-        reconstruction_loss(*map(jnp.asarray, (drawn, target, weight)))[0], error / variance, rtol=1e-5)
-    constant = jnp.broadcast_to(target.mean(0), target.shape)
-    np.testing.assert_allclose(reconstruction_loss(constant, jnp.asarray(target))[0], 1, rtol=1e-5)
-    assert float(reconstruction_loss(jnp.asarray(target), jnp.asarray(target))[0]) == 0
+        variables_loss(jnp.asarray(guess), jnp.asarray(truth), kinds, jnp.asarray(weight))[0],
+        np.log(error) + entropy, rtol=1e-5)
+    real = jnp.asarray(truth[:, :1])
+    np.testing.assert_allclose(variables_loss(real, real, (None,))[0], np.log(0.01), rtol=1e-6)
+    with pytest.raises(AssertionError):
+        variables_loss(jnp.asarray(guess), jnp.asarray(truth), (None, 4))
 
 
-@pytest.mark.parametrize("correlation", [0.3, 0.9, 0.999])
-def test_reconstruction_bounds_the_information_of_gaussians_tightly(correlation: float) -> None:
-    """x and z of D independent pairs: the best drawing is their regression, and D / 2 log(1 / loss) is I(x; z)."""
-    size, rows = 3, 200_000
-    z, noise = np.random.default_rng(0).normal(size=(2, rows, size)).astype(np.float32)
-    x = correlation * z + np.sqrt(1 - correlation**2) * noise
-    loss = float(reconstruction_loss(jnp.asarray(correlation * z), jnp.asarray(x))[0])
-    information = -size / 2 * np.log(1 - correlation**2)
-    np.testing.assert_allclose(size / 2 * np.log(1 / loss), information, atol=0.02)
+@pytest.mark.parametrize("scale", [0.05, 0.3, 2.0])
+def test_variables_loss_bounds_the_information_of_laplace_noise_tightly(scale: float) -> None:
+    """y = z + noise of Laplace: h(y | z) = 1 + log 2b, which the loss gives but for the constant 1 + log 2."""
+    z, noise = np.random.default_rng(0).laplace(size=(2, 200_000, 1)).astype(np.float32)
+    loss = float(variables_loss(jnp.asarray(z), jnp.asarray(z + scale * noise), (None,))[0])
+    np.testing.assert_allclose(1 + np.log(2) + loss, 1 + np.log(2 * scale), atol=0.01)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from envs_mjx.base import Variable
 from envs_mjx.robot import depth, scene, window
 from envs_mjx.robot.plan import Plan, Stroke
 from envs_mjx.robot.task import RobotState, RobotTask, first_valid, turn_common
@@ -38,6 +39,7 @@ class DrawerOpening(RobotTask):
     opening, has_pad = window.TASKS[name]
     plan = Plan(hover=0.11, work=0.01, patience=3, retreat=(0.0, 0.0, 1.0, 0.0))
     expert_noise = 0.2
+    variables = (*RobotTask.variables, Variable("rot cos", hidden=False), Variable("rot sin", hidden=False))
     placed = ("loose", "fixed")
 
     def xml(self, visual: bool = False) -> str:
@@ -88,6 +90,11 @@ class DrawerOpening(RobotTask):
         yaw = env_state.poses[:, 2]
         direction = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=1)
         return jnp.concatenate([env_state.poses[:, :2] - before[:, None] * direction, yaw[:, None]], axis=1)
+
+    def ground_truth(self, env_state: RobotState) -> jax.Array:
+        """(10,) float32: as of every task, and cosine and sine of the way from the handles to the cabinets."""
+        rot = env_state.poses[0, 2]
+        return jnp.concatenate([super().ground_truth(env_state), jnp.stack([jnp.cos(rot), jnp.sin(rot)])])
 
     def solved(self, env_state: RobotState) -> jax.Array:
         """() bool: whether the loose drawer is open."""

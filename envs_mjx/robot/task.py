@@ -81,8 +81,9 @@ class RobotTask(Environment):
     """How the scripted expert works; `stroke` says where."""
     expert_noise = 0.0
     """Standard deviation of what is added to the actions of demonstrations, in fractions of the largest action."""
-    variables = (Variable("movable", hidden=True, num_values=2),
-                 *(Variable(name, hidden=False) for name in ("height", "nearer x", "nearer y")))
+    variables = (Variable("nearer moves", hidden=True, num_values=2),
+                 *(Variable(name, hidden=False) for name in (
+                     "height", "turn cos", "turn sin", "nearer x", "nearer y", "farther x", "farther y")))
 
     def __init__(self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None) -> None:
         """Options that make a policy fit for a robot.
@@ -248,17 +249,24 @@ class RobotTask(Environment):
         return dataclasses.replace(turned, noise_key=noise_key), rotation.rotate_action(action, angle)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(4,) float32: which object is movable; the gripper's height; where the nearer object is from the gripper.
-
-        The other object is often out of view.
+        """(8,) float32: whether the nearer object is the movable one; the gripper's height; cosine and sine of twice
+        its yaw, as it looks the same after half a turn; where both objects are from it, 0 where out of view. Metres.
         """
         offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
-        nearer = offsets[jnp.argmin(jnp.sum(jnp.square(offsets), axis=1))]
-        return jnp.concatenate([env_state.movable.astype(jnp.float32)[None], env_state.qpos[2:3], nearer])
+        order = jnp.argsort(jnp.sum(jnp.square(offsets), axis=1))
+        turn = 2 * env_state.qpos[3]
+        return jnp.concatenate([
+            (order[0] == env_state.movable).astype(jnp.float32)[None], env_state.qpos[2:3],
+            jnp.stack([jnp.cos(turn), jnp.sin(turn)]), *(where_in_view(offset) for offset in offsets[order])])
 
     def reveals(self, env_state: RobotState) -> jax.Array:
         """() bool: whether an object has been touched, from when on what is seen can tell which one moves."""
         return env_state.touched
+
+
+def where_in_view(offset: jax.Array) -> jax.Array:
+    """(2,) x, y from the gripper as they are within its window, 0 elsewhere."""
+    return jnp.where(jnp.max(jnp.abs(offset)) < depth.WINDOW / 2, offset, 0.0)
 
 
 def turn_common(env_state: RobotState, angle: jax.Array) -> RobotState:

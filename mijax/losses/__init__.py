@@ -12,10 +12,10 @@ from mijax.losses.information import (
     prediction_mse,
 )
 from mijax.losses.masks import masked_mean
-from mijax.losses.reconstruction import reconstruction_loss
 from mijax.losses.returns import traced_returns
 from mijax.losses.sac import actor_loss, critic_loss, imitation_loss, sample_tanh_gaussian, temperature_loss
 from mijax.losses.td import double_q_value, td_loss
+from mijax.losses.variables import variables_loss
 
 __all__ = [
     "actor_loss",
@@ -36,10 +36,10 @@ __all__ = [
     "next_feature_loss",
     "prediction_cosine",
     "prediction_mse",
-    "reconstruction_loss",
     "reward_loss",
     "sample_tanh_gaussian",
     "td_loss",
     "temperature_loss",
     "traced_returns",
+    "variables_loss",
 ]

@@ -125,6 +125,7 @@ class TransitionTable:
     next_state: jax.Array  # (K,) int32
     next_observation: jax.Array  # (K,) int32
     terminal: jax.Array  # (K,) bool
+    ground_truth: jax.Array  # (K, V) float32
 
     @property
     def size(self) -> int:

@@ -7,18 +7,15 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from envs_mjx.base import ActionSpec, ArraySpec, DiscreteActions, Environment
+from envs_mjx.base import ActionSpec, DiscreteActions, Environment, Variable
 from mijax.config import LowerBound
 from mijax.frames import Frames
-from mijax.nets.encoders import Encoder, about_mean, encoder_for
+from mijax.nets.encoders import Encoder, encoder_for
 from mijax.types import Params
 
 ACTION_WIDTH = 16
 DYNAMICS_HIDDEN = (256, 256, 256)
 ESTIMATOR_HIDDEN = 32
-DECODER_HIDDEN = (256, 256)
-DRAWN_CELLS = 24
-"""A decoder draws at most so many rows of cells, each the mean of its pixels: 21 of an image of 84 rows."""
 
 
 class Dynamics(nn.Module):
@@ -47,34 +44,6 @@ class Estimator(nn.Module):
         return mean, log_variance
 
 
-class Decoder(nn.Module):
-    """(B, F) features -> (B, D): a frame as `drawn` has it."""
-
-    size: int
-
-    @nn.compact
-    def __call__(self, z: jax.Array) -> jax.Array:
-        for width in DECODER_HIDDEN:
-            z = nn.relu(nn.Dense(width)(z))
-        return nn.Dense(self.size)(z)
-
-
-def drawn(frames: jax.Array, spec: ArraySpec) -> jax.Array:
-    """(B, D) float32, what a decoder is to draw of (B, *shape) frames.
-
-    Vectors as they are. Images without their blank channels, as an encoder sees them, in cells of equally many pixels.
-    """
-    x = frames.astype(jnp.float32)
-    if not spec.is_image:
-        return x
-    rows, columns, channels = spec.shape
-    side = -(-max(rows, columns) // DRAWN_CELLS)
-    x = x[:, : rows // side * side, : columns // side * side, : channels - spec.blank]
-    x = about_mean(x, spec.contrast) if spec.contrast > 0 else x
-    return jnp.mean(x.reshape(-1, rows // side, side, columns // side, side, x.shape[-1]), axis=(2, 4)).reshape(
-        x.shape[0], -1)
-
-
 @dataclasses.dataclass(frozen=True)
 class Networks:
     """All modules of stage 1 for one environment."""
@@ -84,12 +53,13 @@ class Networks:
     dynamics: Dynamics
     estimator: Estimator
     action_spec: ActionSpec
-    observation_spec: ArraySpec
+    seen: tuple[Variable, ...]
+    """The variables that are not hidden."""
 
-    def draw(self, decoder: Params, z_o: jax.Array, observations: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """(B, D) what a decoder draws of (B, F) features, and what it should have drawn of (B, *shape) observations."""
-        target = drawn(observations, self.observation_spec)
-        return evaluate(Decoder(target.shape[1]), decoder, z_o), target
+    @property
+    def told(self) -> nn.Dense:
+        """(B, F) z_o -> (B, W) guesses of what can be seen of the variables, for `variables_loss`."""
+        return nn.Dense(sum(variable.num_values or 1 for variable in self.seen))
 
     def encode_action(self, action: jax.Array) -> jax.Array:
         """(..., A) float32: discrete actions one-hot, continuous ones as they are."""
@@ -118,7 +88,7 @@ def networks_for(env: Environment, features: int) -> Networks:
     return Networks(
         phi=encoder_for(env.state_spec, features), psi=encoder_for(env.observation_spec, features),
         dynamics=Dynamics(features), estimator=Estimator(features), action_spec=env.action_spec,
-        observation_spec=env.observation_spec)
+        seen=tuple(variable for variable in env.variables if not variable.hidden))
 
 
 def init_parameters(
@@ -127,7 +97,7 @@ def init_parameters(
 ) -> dict[str, Params]:
     """Fresh parameters of all networks, by the names that `train` uses; both arrays have a leading axis.
 
-    Under `lower_bound` "reconstruction" a decoder is in the place of the observations' discriminator.
+    Under `lower_bound` "variables" what tells them is in the place of the observations' discriminator.
     """
     keys = jax.random.split(key, 6)
     z = jnp.zeros((1, networks.phi.features), jnp.float32)
@@ -138,8 +108,8 @@ def init_parameters(
 
     phi = networks.phi.init(keys[0], state)["params"]
     psi = networks.psi.init(keys[1], observation)["params"]
-    if lower_bound == "reconstruction":
-        of_o = Decoder(drawn(observation, networks.observation_spec).shape[1]).init(keys[3], z)["params"]
+    if lower_bound == "variables":
+        of_o = networks.told.init(keys[3], z)["params"]
     else:
         of_o = discriminator(networks.psi, psi, keys[3], observation)
     return {

@@ -60,6 +60,9 @@ class Problem:
     @classmethod
     def of(cls, env: Environment, config: Stage1Config, data: Transitions) -> "Problem":
         """Everything about `data` that can be worked out before training; `ConfigError` if it fills no batch."""
+        if config.lower_bound == "variables" and all(variable.hidden for variable in env.variables):
+            raise ConfigError("--stage1.lower-bound: got 'variables', accepted: 'jensen_shannon', as "
+                              f"{env.name} declares no variables that can be seen")
         if data.size < config.batch_size:
             raise ConfigError(f"--stage1.batch-size: got {config.batch_size}, accepted: at most the {data.size} "
                               f"transitions of --stage1.episodes {config.episodes}")
@@ -79,6 +82,15 @@ class Problem:
         """Transitions, copies included: number c N + i is copy c of transition i, copy 0 the original."""
         return self.data.size * (1 + self.config.copies)
 
+    def seen(self, ground_truth: jax.Array) -> jax.Array:
+        """(B, V) variables -> (B, V') float32: those that are not hidden, real ones in standard deviations."""
+        columns = [i for i, variable in enumerate(self.env.variables) if not variable.hidden]
+        known = np.asarray(self.data.ground_truth)[:, columns]
+        real = np.array([self.env.variables[i].num_values is None for i in columns])
+        center = np.where(real, known.mean(axis=0), 0.0).astype(np.float32)
+        scale = np.where(real & (known.std(axis=0) > 0), known.std(axis=0), 1.0).astype(np.float32)
+        return (ground_truth[:, jnp.asarray(columns)] - center[None]) / scale[None]
+
     @property
     def updates_per_epoch(self) -> int:
         """Whole batches in the data set."""
@@ -96,21 +108,21 @@ class Problem:
         return Batch(rows, weight, reward_weight, shown, noise)
 
     def _augment(self, rows: TransitionTable, copy: jax.Array, key: jax.Array) -> tuple[TransitionTable, Shown]:
-        """Frames and actions of (B',) rows, each moved by a symmetry of its own where `copy`."""
+        """Frames, actions and variables of (B',) rows, each moved by a symmetry of its own where `copy`."""
 
-        def look(row: tuple) -> tuple[jax.Array, Shown]:
+        def look(row: tuple) -> tuple[jax.Array, jax.Array, Shown]:
             now, after, action, copy, key = row
             moved = [self.env.augment(key, jax.tree.map(lambda x, i=i: x[i], self.data.moments), action)
                      for i in (now, after)]
             moments = [jax.tree.map(lambda x, m, i=i: jnp.where(copy, m, x[i]), self.data.moments, m)
                        for i, (m, _) in zip((now, after), moved, strict=True)]
             now, after = (self.env.show(moment) for moment in moments)
-            return jnp.where(copy, moved[0][1], action), Shown(
+            return jnp.where(copy, moved[0][1], action), self.env.ground_truth(moments[0]), Shown(
                 now.state, now.observation, after.state, after.observation)
 
         keys = jax.random.split(key, rows.size)
-        action, shown = jax.vmap(look)((rows.state, rows.next_state, rows.action, copy, keys))
-        return dataclasses.replace(rows, action=action), shown
+        action, truth, shown = jax.vmap(look)((rows.state, rows.next_state, rows.action, copy, keys))
+        return dataclasses.replace(rows, action=action, ground_truth=truth), shown
 
     def _rows(self, chosen: jax.Array, key: jax.Array) -> tuple[TransitionTable, jax.Array, jax.Array]:
         rows, size = self.row[chosen], self.config.batch_size

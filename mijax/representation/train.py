@@ -24,7 +24,7 @@ from mijax.losses.belief import kl_standard_normal
 from mijax.losses.club import club_all_pairs, gaussian_fit
 from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
-from mijax.losses.reconstruction import reconstruction_loss
+from mijax.losses.variables import variables_loss
 from mijax.nets.encoders import Encoder
 from mijax.representation.dataset import Transitions, collect
 from mijax.representation.model import evaluate, init_parameters, local_features
@@ -268,10 +268,11 @@ def encoder_loss(
         terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, s, weight)
     if f.local_o is not None:
         terms["dim_o_loss"] = weights.lambda_dim_o, dim_loss(f.z_o, f.local_o, o, weight)
-    if problem.config.lower_bound == "reconstruction" and problem.config.lambda_dim_o > 0:
-        frames = problem.data.observations[rows.observation] if batch.shown is None else batch.shown.observation
-        drawing = networks.draw(parameters["discriminator_o"], f.z_o, frames)
-        terms["drawn_o_loss"] = weights.lambda_dim_o, reconstruction_loss(*drawing, weight)[0]
+    if problem.config.lower_bound == "variables" and problem.config.lambda_dim_o > 0:
+        told = evaluate(networks.told, parameters["discriminator_o"], f.z_o)
+        kinds = [variable.num_values for variable in networks.seen]
+        terms["told_o_loss"] = weights.lambda_dim_o, variables_loss(
+            told, problem.seen(rows.ground_truth), kinds, weight)[0]
     total = sum((scale * value for scale, value in terms.values()), jnp.zeros((), jnp.float32))
     return total, (fit, {"loss": total} | {name: value for name, (_, value) in terms.items()})
 

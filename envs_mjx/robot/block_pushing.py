@@ -34,7 +34,7 @@ class BlockPushing(BlockTask):
     block = Block(side=0.05, height=0.05, mass=0.02, friction=1.0)
     variables = (*BlockTask.variables, Variable("pad x", hidden=False), Variable("pad y", hidden=False))
     reach = 0.05
-    expert_noise = 0.3
+    expert_noise = 0.15
     blocks_collide = True
 
     def draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:

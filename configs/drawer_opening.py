@@ -2,7 +2,8 @@
 
     python -m mijax.train --domain drawer_opening
 
-Success 0.974 and 0.970 of 496 episodes, two seeds (results/robots). A quarter of an hour of one core, stage 1 included.
+Success 0.974, 0.970 and 0.982 of 496 episodes, three seeds (results/robots). A quarter of an hour of one
+core, stage 1 included.
 """
 
 from configs.robots import robot

@@ -232,7 +232,8 @@ class SACConfig:
     demonstration_share: float = 0.0
     """Probability with which an episode of a batch is drawn among the demonstrations alone (paper: 0)."""
     pretrain_updates: int = 0
-    """Updates on the demonstrations before the agent acts for the first time (paper: 0)."""
+    """Updates on the demonstrations, and the few random episodes, before the agent acts (paper: 0); rounded up to what
+    belongs to num-envs x steps-per-iteration steps."""
     imitation_weight: float = 0.0
     """Weight of the loss that brings the actor's mean action near a demonstration's, and its scale to the distance
     that is left (paper: 0)."""

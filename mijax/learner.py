@@ -49,7 +49,7 @@ class LearnerState:
     episodes: Episodes
     replay: Replay
     key: jax.Array  # typed PRNG key; every iteration folds its number into it
-    iteration: jax.Array  # () int32
+    iteration: jax.Array  # () int32, the next one; below 0 before the end of pre-training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +65,7 @@ class Learner:
     pack: bool = True  # choose the number of packed rows at run time; a branch that `vmap` would turn into all of them
 
     def init(self, key: jax.Array, representation: Representation | None) -> LearnerState:
-        """Fresh networks, trained on the demonstrations where there are any, and a replay warmed up by random episodes.
-        """
+        """Fresh networks, and a replay of demonstrations, where there are any, and of random episodes."""
         key_agent, key_start, key_warmup, key_run = jax.random.split(key, 4)
         num_envs = self.config.num_envs
         episodes = start_episodes(self.env, self.agent, num_envs, key_start, self.agent.copies > 0)
@@ -81,13 +80,11 @@ class Learner:
             episodes=episodes,
             replay=write(replay, first, episodes.position),
             key=key_run,
-            iteration=jnp.zeros((), jnp.int32),
+            iteration=jnp.full((), -self.pretrain_iterations, jnp.int32),
         )
         if self.agent.declaration.believes:
             state = dataclasses.replace(state, agent=self._believe(state, jax.random.fold_in(key, 5)))
-        if self.demonstrations and self.config.sac.pretrain_updates:
-            state, _ = self._learn(state, jax.random.fold_in(key, 6), self.config.sac.pretrain_updates)
-        return self._collect(state, jnp.ones(()), self.warmup_steps // num_envs, key_warmup)[0]
+        return self._collect(state, jnp.ones(()), jax.random.split(key_warmup, self.warmup_steps // num_envs))[0]
 
     def _first(self, representation: Representation | None, episodes: Episodes) -> StepRecord:
         """What the replay stores of where episodes stand."""
@@ -131,7 +128,8 @@ class Learner:
         random = dataclasses.replace(
             state, episodes=open_episodes, replay=write(replay, first, open_episodes.position))
         rounds = -(-self.config.stage1.episodes // num_envs)
-        random, _ = self._collect(random, jnp.ones(()), rounds * self.env.horizon, key_collect)
+        keys = jax.random.split(key_collect, rounds * self.env.horizon)
+        random, _ = self._collect(random, jnp.ones(()), keys)
 
         def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, None]:
             return self.update(agent, random.replay, state.representation, key, pretrain=True)[0], None
@@ -161,37 +159,57 @@ class Learner:
         return self.config.updates_per_iteration(self.agent.group, self.agent.options.updates_per_step)
 
     @property
+    def pretrain_iterations(self) -> int:
+        """Iterations of updates alone, before the first step: as many as hold `--sac.pretrain-updates`."""
+        return -(-self.config.sac.pretrain_updates // self.updates_per_iteration) if self.demonstrations else 0
+
+    @property
     def iterations_per_chunk(self) -> int:
         """Iterations between two evaluations."""
         return self.config.evaluation.every // self.config.iteration_steps
 
     def environment_steps(self, state: LearnerState) -> jax.Array:
         """() int32: environment steps so far, the warm-up included."""
-        return self.warmup_steps + state.iteration * self.config.iteration_steps
+        return self.warmup_steps + jnp.maximum(state.iteration, 0) * self.config.iteration_steps
 
     def epsilon(self, environment_steps: jax.Array) -> jax.Array:
         """() exploration after so many steps."""
         return self.agent.epsilon(environment_steps)
 
-    def run_chunk(self, state: LearnerState, iterations: int | None = None) -> tuple[LearnerState, Metrics]:
-        """Advance by `iterations` (default: up to the next evaluation); metrics are means over the chunk."""
+    def run_chunk(
+        self, state: LearnerState, iterations: jax.Array | int | None = None, acts: jax.Array | bool = True
+    ) -> tuple[LearnerState, Metrics]:
+        """Advance by `iterations`; metrics are means over them.
 
-        def iterate(state: LearnerState, _: None) -> tuple[LearnerState, tuple[EpisodeTotals, Metrics]]:
+        Args:
+            state: of one seed.
+            iterations: () int32, at least 1; default: up to the next evaluation.
+            acts: () bool, whether the environments are stepped: not in pre-training. Both may be traced, so that one
+                compiled program serves all; under `vmap` they are not to be mapped, as every branch would then run.
+        """
+        iterations = self.iterations_per_chunk if iterations is None else iterations
+        steps = jnp.where(acts, self.config.steps_per_iteration, 0)
+
+        def iterate(_: jax.Array, carry: tuple) -> tuple[LearnerState, EpisodeTotals, Metrics]:
+            state, totals, losses = carry
             key_collect, key_update = jax.random.split(jax.random.fold_in(state.key, state.iteration))
             epsilon = self.epsilon(self.environment_steps(state))
-            state, totals = self._collect(state, epsilon, self.config.steps_per_iteration, key_collect)
-            state, metrics = self._learn(state, key_update, self.updates_per_iteration)
-            return dataclasses.replace(state, iteration=state.iteration + 1), (totals, metrics)
+            keys = jax.random.split(key_collect, self.config.steps_per_iteration)
+            state, added = self._collect(state, epsilon, keys, steps)
+            state, metrics = self._learn(state, key_update)
+            state = dataclasses.replace(state, iteration=state.iteration + 1)
+            return state, *jax.tree.map(jnp.add, (totals, losses), (added, metrics))
 
-        state, (totals, losses) = jax.lax.scan(iterate, state, None, iterations or self.iterations_per_chunk)
-        totals = jax.tree.map(lambda x: jnp.sum(x, axis=0), totals)
-        metrics = jax.tree.map(jnp.mean, losses) | totals.metrics()
+        losses = jax.tree.map(
+            lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(self._learn, state, state.key)[1])
+        state, totals, losses = jax.lax.fori_loop(0, iterations, iterate, (state, EpisodeTotals.zero(), losses))
+        metrics = jax.tree.map(lambda x: x / iterations, losses) | totals.metrics()
         return state, metrics | {"train/epsilon": self.epsilon(self.environment_steps(state))}
 
     def collect_chunk(self, state: LearnerState) -> EpisodeTotals:
         """The environment steps of one chunk without its updates: what acting and stepping alone cost."""
-        steps = self.iterations_per_chunk * self.config.steps_per_iteration
-        return self._collect(state, self.epsilon(self.environment_steps(state)), steps, state.key)[1]
+        keys = jax.random.split(state.key, self.iterations_per_chunk * self.config.steps_per_iteration)
+        return self._collect(state, self.epsilon(self.environment_steps(state)), keys)[1]
 
     def evaluate(self, state: LearnerState, key: jax.Array, num_episodes: int, actor: Actor | None = None) -> Metrics:
         """Greedy episodes of the averaged network: per-episode results, each (num_episodes,); `actor`: played by
@@ -250,24 +268,25 @@ class Learner:
         return record
 
     def _collect(
-        self, state: LearnerState, epsilon: jax.Array, steps: int, key: jax.Array
+        self, state: LearnerState, epsilon: jax.Array, keys: jax.Array, steps: jax.Array | None = None
     ) -> tuple[LearnerState, EpisodeTotals]:
+        """One step in every environment for each of (K,) keys, or for the first `steps` of them, () int32."""
         record = self.recorder(state.representation)
         params = state.agent.params["agent"]
 
-        def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
-            episodes, replay, totals = carry
-            return collect_step(self.env, self.agent, params, record, epsilon, episodes, replay, totals, key), None
+        def step(number: jax.Array, carry: tuple[Episodes, Replay, EpisodeTotals]) -> tuple:
+            return collect_step(self.env, self.agent, params, record, epsilon, *carry, keys[number])
 
         carry = (state.episodes, state.replay, EpisodeTotals.zero())
-        (episodes, replay, totals), _ = jax.lax.scan(step, carry, jax.random.split(key, steps))
+        episodes, replay, totals = jax.lax.fori_loop(0, len(keys) if steps is None else steps, step, carry)
         return dataclasses.replace(state, episodes=episodes, replay=replay), totals
 
-    def _learn(self, state: LearnerState, key: jax.Array, updates: int) -> tuple[LearnerState, Metrics]:
+    def _learn(self, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Metrics]:
+        """The updates of one iteration."""
         def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, Metrics]:
             return self.update(agent, state.replay, state.representation, key)
 
-        agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, updates))
+        agent, metrics = jax.lax.scan(update, state.agent, jax.random.split(key, self.updates_per_iteration))
         return dataclasses.replace(state, agent=agent), jax.tree.map(jnp.mean, metrics)
 
     def update(

@@ -59,7 +59,8 @@ class SeedRunner:
         self._mapped = mapped
         self._evaluations: dict[int, Callable] = {}  # by number of episodes
         self._init = jax.jit(mapped(self.learner.init))
-        self._chunk = jax.jit(mapped(self.learner.run_chunk), donate_argnums=0)
+        chunk = self.learner.run_chunk
+        self._chunk = jax.jit(jax.vmap(chunk, (0, None, None)) if self.strategy == "vmap" else chunk, donate_argnums=0)
         self._states: dict[int, LearnerState] = {}  # by seed; under vmap one state of all, stored by the first seed
 
     def init(self, representations: dict[int, Representation] | None) -> None:
@@ -69,6 +70,13 @@ class SeedRunner:
         if self.strategy == "vmap":
             keys, rep = self._stack(keys), self._stack(rep)
         self._states = self._each(lambda key, rep: self._init(key, rep), keys, rep)
+
+    def pretrain(self, report: Callable[[int], None]) -> None:
+        """Updates on the demonstrations, where there are any: up to the first step. A chunk at a time, after which
+        `report` is told how many updates every seed has made."""
+        while (left := -self._iteration) > 0:
+            self._run(min(left, self.learner.iterations_per_chunk), acts=False)
+            report((self.learner.pretrain_iterations + self._iteration) * self.learner.updates_per_iteration)
 
     def states(self) -> dict[int, LearnerState]:
         """The state of every seed, for a checkpoint."""
@@ -85,8 +93,11 @@ class SeedRunner:
     @property
     def step(self) -> int:
         """Environment steps that every seed has made."""
-        iteration = np.ravel(self._states[self.seeds[0]].iteration)[0]
-        return self.learner.warmup_steps + int(iteration) * self.learner.config.iteration_steps
+        return self.learner.warmup_steps + max(self._iteration, 0) * self.learner.config.iteration_steps
+
+    @property
+    def _iteration(self) -> int:
+        return int(np.ravel(self._states[self.seeds[0]].iteration)[0])
 
     @property
     def last_step(self) -> int:
@@ -97,9 +108,12 @@ class SeedRunner:
 
     def advance(self) -> dict[int, dict[str, float]]:
         """Run one chunk of every seed; metrics by seed."""
-        results = self._each(self._chunk, self._states)
+        return self._by_seed(self._run(self.learner.iterations_per_chunk, acts=True))
+
+    def _run(self, iterations: int, acts: bool) -> dict[int, Metrics]:
+        results = self._each(lambda state: self._chunk(state, jnp.int32(iterations), jnp.bool_(acts)), self._states)
         self._states = {seed: state for seed, (state, _) in results.items()}
-        return self._by_seed({seed: metrics for seed, (_, metrics) in results.items()})
+        return {seed: metrics for seed, (_, metrics) in results.items()}
 
     def evaluate(self, num_episodes: int) -> dict[int, dict[str, float]]:
         """Greedy evaluation of every seed: means over the episodes."""

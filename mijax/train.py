@@ -230,14 +230,18 @@ def _start(
         require(shown, "sac.demonstrations", runner.learner.demonstrations,
                 f"0, as the expert of {runner.learner.env.name} solves none of its episodes; in another --out, with "
                 f"--representation {run.path} where stage 1 is done")
+        updates = runner.learner.pretrain_iterations * runner.learner.updates_per_iteration
+        if updates:
+            with ProgressDisplay("pre-training", updates, unit="updates") as progress:
+                runner.pretrain(progress.update)
         runtime.release_memory()
 
 
 def _prelude(learner: Learner) -> str:
-    """What comes before the first evaluation, which on a robot takes minutes."""
+    """What comes before the first update, which on a robot takes a minute or two."""
     config, parts = learner.config, []
     if learner.demonstrations:
-        parts.append(f"{learner.demonstrations} demonstrations and {config.sac.pretrain_updates:,} updates on them")
+        parts.append(f"{learner.demonstrations} demonstrations")
     if learner.agent.declaration.believes:
         parts.append(f"{config.believer.updates:,} updates of the history model")
     parts.append(f"{learner.warmup_steps:,} random steps")

@@ -510,11 +510,18 @@ def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
         ("ua", "shared"), ("believer", "shared"), ("believer", "psi"), ("base", "psi"), ("mdp", "shared")))])
 def test_every_agent_runs_in_the_loop(agent: str, trunk: Any):
     sac = dataclasses.replace(
-        LOOP.sac, trunk=trunk, pretrain_updates=3, imitation_weight=1.0, imitate_successes=True)
+        LOOP.sac, trunk=trunk, pretrain_updates=5, imitation_weight=1.0, imitate_successes=True)
     run = Run(dataclasses.replace(LOOP, agent=agent, memory="auto", sac=sac,
                                   stage1=Stage1Config(features=FEATURES, episodes=4)))
-    state, metrics = run.chunk(run.start())
-    assert int(state.agent.updates) == 3 + 12
+    start = run.start()
+    assert int(start.iteration) == -1
+    ready, _ = run.chunk(start, 1, acts=False)
+    assert int(ready.agent.updates) == 6  # those of whole iterations
+    jax.tree.map(np.testing.assert_array_equal, ready.replay, start.replay)
+    state, metrics = run.chunk(ready, 2, acts=True)
+    assert int(state.iteration) == 2
+    assert int(state.agent.updates) == 6 + 12
+    assert int(run.learner.environment_steps(state)) == run.learner.warmup_steps + 12
     assert all(np.isfinite(x) for name, x in jax.device_get(metrics).items() if name.startswith(("loss/", "actor/")))
     results = jax.device_get(run.evaluate(state, jax.random.key(0), 3))
     assert (results["length"] == Compass.choice + 1).all()
@@ -558,9 +565,8 @@ def test_acting_sees_no_state():
 @pytest.mark.lenient
 def test_a_seed_is_the_same_alone_and_beside_others_and_goes_on_where_it_stopped(ours: tuple[Run, LearnerState]):
     run, start = ours
-    half = jax.jit(run.learner.run_chunk, static_argnums=1)
-    once, _ = half(start, 2)
-    twice, _ = half(half(start, 1)[0], 1)
+    once, _ = run.chunk(start, 2)
+    twice, _ = run.chunk(run.chunk(start, 1)[0], 1)
 
     def numbers(state: LearnerState) -> list[Any]:
         return jax.tree.leaves((state.agent, state.replay))

@@ -227,7 +227,7 @@ def bench_stage2(bench: Bench, env: Environment) -> Iterator[Result]:
 
 def bench_sac(bench: Bench, env: Environment) -> Iterator[Result]:
     """The preset's SAC updates from a replay of the expert's episodes, by how frames are encoded."""
-    trunks: Sequence[TrunkKind] = ("psi", "shared")
+    trunks: Sequence[TrunkKind] = ("z_o", "psi", "shared")
     for trunk in trunks:
         preset = configs.preset(env.name)
         sac = dataclasses.replace(

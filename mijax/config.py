@@ -16,7 +16,7 @@ IntrinsicForm = Literal["explained_variance", "cosine"]
 LowerBound = Literal["jensen_shannon", "variables"]
 DataSource = Literal["random", "demonstrations"]
 """Whose episodes stage 1 learns from: a random policy's, or those of the environment's expert."""
-TrunkKind = Literal["own", "shared", "psi"]
+TrunkKind = Literal["own", "shared", "psi", "z_o"]
 SeedStrategy = Literal["auto", "map", "vmap", "shard"]
 
 
@@ -251,7 +251,8 @@ class SACConfig:
     """How frames are encoded. own: by a whole encoder in each branch (paper). shared: once per update, for the actor,
     the critics, their targets and f, with a last layer of its own for each branch; the trunk starts from psi where the
     agent does. psi: the trunk is psi's body and stays so, for every agent, as phi's is the state's for a critic that
-    sees states; the replay stores their features, in every copy of an episode, and no update looks at a frame."""
+    sees states; the replay stores their features, in every copy of an episode, and no update looks at a frame. z_o: as
+    psi, but agents see no more of a frame than psi's output, z_o."""
     critic_norm: bool = True
     """Whether the critics' hidden layers are normalised, which keeps values of unseen actions in bounds (paper: no)."""
     bootstrap_at_time_limit: bool = False
@@ -273,6 +274,11 @@ class SACConfig:
                     "0, unless there are --sac.demonstrations")
         require(self.imitation_weight > 0 or not self.imitate_successes, "sac.imitate-successes",
                 self.imitate_successes, "False, unless there is an --sac.imitation-weight")
+
+    @property
+    def looks_through_psi(self) -> bool:
+        """Whether psi, as stage 1 left it, is all that any agent sees frames through."""
+        return self.trunk in ("psi", "z_o")
 
     def updates_in(self, steps: int) -> int:
         """Gradient updates of a run of so many environment steps."""

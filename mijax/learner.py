@@ -246,10 +246,11 @@ class Learner:
                     z_s = cast(jax.Array, phi.apply({"params": representation.phi}, copied.state))
                 if self.agent.looks_once:
                     seen = shown(copied.observation, self.env.observation_spec)
+                    outlet = None if self.config.sac.trunk == "z_o" else "body"
                     observation, state = (
-                        cast(jax.Array, encoder.apply({"params": params}, x, method="body")).astype(jnp.float16)
-                        for encoder, params, x in ((psi, representation.psi, seen),
-                                                   (phi, representation.phi, copied.state)))
+                        cast(jax.Array, encoder.apply({"params": params}, x, method=method)).astype(jnp.float16)
+                        for encoder, params, x, method in ((psi, representation.psi, seen, outlet),
+                                                           (phi, representation.phi, copied.state, "body")))
                     previous_action, intended = actions
             if table is not None:
                 observation = table.index_of(timestep.observation).astype(_integer_for(len(table)))

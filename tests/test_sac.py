@@ -317,15 +317,16 @@ def test_psi_starts_the_trunk_and_every_memoryless_branch():
     env = Shapes(CONTINUOUS)
     rep = representation(env)
     body = {name: part for name, part in rep.psi.items() if name != "output"}
-    for name, trunk in (("mi", "shared"), ("mi", "own"), ("base", "psi")):
+    for name, trunk in (("mi", "shared"), ("mi", "own"), ("base", "psi"), ("mi", "z_o"), ("base", "z_o")):
         config = dataclasses.replace(CONFIG, agent=name, sac=dataclasses.replace(CONFIG.sac, trunk=trunk))
         agent = jax.jit(make_agent(env, config).init)(jax.random.key(3), rep).params["agent"]
         for branch in ("actor", "critic") if name == "mi" else ():
-            expected = rep.psi if trunk == "own" else rep.psi["output"]
+            identity = {"kernel": np.eye(FEATURES), "bias": np.zeros(FEATURES)}
+            expected = {"own": rep.psi, "shared": rep.psi["output"], "z_o": identity}[trunk]
             jax.tree.map(np.testing.assert_array_equal, agent[branch]["bottom"], expected)
         assert ("trunk" in agent) == (trunk != "own")
         if trunk != "own":
-            jax.tree.map(np.testing.assert_array_equal, agent["trunk"], body)
+            jax.tree.map(np.testing.assert_array_equal, agent["trunk"], rep.psi if trunk == "z_o" else body)
 
 
 def test_titles_follow_the_algorithm():
@@ -478,10 +479,11 @@ def test_what_an_expert_meant_is_turned_too(trunk: str):
 
 
 @pytest.mark.lenient
-def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
-    """The replay holds what psi's body says of each copy; updates get that, and leave the trunk alone."""
+@pytest.mark.parametrize(("trunk", "method"), [("psi", "body"), ("z_o", "__call__")])
+def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState], trunk: Any, method: str):
+    """The replay holds what psi or its body says of each copy; updates get that, and leave the trunk alone."""
     run, state = ours
-    frozen = Run(dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, trunk="psi")))
+    frozen = Run(dataclasses.replace(LOOP, sac=dataclasses.replace(LOOP.sac, trunk=trunk)))
     start = frozen.start()
     slots = state.replay.finished[jnp.zeros((8,), jnp.int32)]
 
@@ -492,7 +494,7 @@ def test_a_frozen_trunk_looks_once(ours: tuple[Run, LearnerState]):
     real = np.asarray(shown.segment).reshape(-1) > 0
     assert run.representation is not None
     psi = networks_for(Compass(), FEATURES).psi
-    wanted = psi.apply({"params": run.representation.psi}, jnp.asarray(shown.frames), method="body")
+    wanted = psi.apply({"params": run.representation.psi}, jnp.asarray(shown.frames), method=method)
     np.testing.assert_allclose(np.asarray(seen.frames)[real], np.asarray(wanted)[real], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(seen.previous_action, shown.previous_action, atol=1e-6)
     np.testing.assert_allclose(

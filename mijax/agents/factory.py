@@ -25,7 +25,8 @@ def make_agent(env: Environment, config: Config) -> Agent:
     require(demonstrations == 0 or has_expert(env), "sac.demonstrations", demonstrations,
             f"0, as {env.name} has no expert")
     if isinstance(env.action_spec, DiscreteActions):
-        require(config.sac.trunk != "psi", "sac.trunk", config.sac.trunk, f"own or shared: {env.name} is not for SAC")
+        require(not config.sac.looks_through_psi, "sac.trunk", config.sac.trunk,
+                f"own or shared: {env.name} is not for SAC")
     if needs_representation(config):
         require(config.stage1.data == "random" or has_expert(env), "stage1.data", config.stage1.data,
                 f"random, as {env.name} has no expert")

@@ -51,8 +51,8 @@ class SAC(Agent):
 
     @property
     def looks_once(self) -> bool:
-        """Where psi's body is the trunk and stays as it is."""
-        return self.options.trunk == "psi" and not self.declaration.sees_state
+        """Where psi, or its body, is the trunk and stays as it is."""
+        return self.options.looks_through_psi and not self.declaration.sees_state
 
     @property
     def target_entropy(self) -> float:
@@ -75,14 +75,19 @@ class SAC(Agent):
         return {"log_temperature": jnp.log(jnp.float32(self.options.initial_temperature))}
 
     def start_from(self, agent: Params, representation: Representation) -> Params:
-        """psi in every memoryless branch: its body in the trunk and its output layer in each branch, or all of it."""
+        """psi in every memoryless branch: its body in the trunk and its output layer in each branch, or all of it. On a
+        trunk that is psi as a whole, the layer of each branch begins as the identity."""
         if self.declaration.sees_state:
             if self.config.mdp.sees != "state":
                 return agent | {"features": {"phi": representation.phi, "psi": representation.psi}}
             return agent
         from_psi = self.declaration.uses_representation and self.config.information.start_from_psi
-        psi, started = dict(representation.psi), {}
-        bottom = psi.pop("output") if "trunk" in agent else representation.psi
+        psi, bottom, started = dict(representation.psi), representation.psi, {}
+        if self.options.trunk == "z_o":
+            features = self.config.stage1.features
+            bottom = {"kernel": jnp.eye(features), "bias": jnp.zeros((features,))}
+        elif "trunk" in agent:
+            bottom = psi.pop("output")
         if from_psi:
             branches = (name for name in ("actor", "critic", "history") if name in agent)
             started = {name: agent[name] | {"bottom": bottom} for name in branches}
@@ -261,12 +266,13 @@ def _network(env: Environment, config: Config, declaration: Variant) -> ActorCri
         seen = PrivilegedFeatures(env.state_spec, spec, features, config.mdp.sees)
         return PrivilegedActorCritic(size, net, spec, norm, features=seen)
     trunk = encoder_for(spec, features, dtype) if config.sac.trunk != "own" else None
-    branch_spec = spec if trunk is None else _body_spec(spec)
-    state_spec = _body_spec(env.state_spec) if config.sac.trunk == "psi" else env.state_spec
+    whole = config.sac.trunk == "z_o"
+    branch_spec = spec if trunk is None else ArraySpec((features,)) if whole else _body_spec(spec)
+    state_spec = _body_spec(env.state_spec) if config.sac.looks_through_psi else env.state_spec
     history = HistoryEncoder(size, env.horizon + 1, memory_of(config), net)
     if declaration.believes:
         belief = BeliefBranches(history, branch_spec, features, config.believer, after_trunk=trunk is not None)
-        return BeliefActorCritic(size, net, spec, norm, trunk, history=belief)
+        return BeliefActorCritic(size, net, spec, norm, trunk, whole, history=belief)
 
     def branch() -> TwoBranch:
         return TwoBranch(
@@ -275,7 +281,7 @@ def _network(env: Environment, config: Config, declaration: Variant) -> ActorCri
             after_trunk=trunk is not None)
 
     return TwoBranchActorCritic(
-        size, net, spec, norm, trunk, actor=branch(), critic=None if declaration.critic == "state" else branch(),
+        size, net, spec, norm, trunk, whole, actor=branch(), critic=None if declaration.critic == "state" else branch(),
         critic_sees=declaration.critic, state_spec=state_spec, actor_moves_trunk=declaration.critic is not None)
 
 

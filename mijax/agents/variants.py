@@ -66,7 +66,7 @@ def needs_representation(config: Config) -> bool:
     declaration = variant(config.agent)
     if declaration.sees_state:
         return config.mdp.sees != "state"
-    return declaration.uses_representation or config.sac.trunk == "psi"
+    return declaration.uses_representation or config.sac.looks_through_psi
 
 
 def unread_groups(config: Config, continuous: bool) -> set[str]:

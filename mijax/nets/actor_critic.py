@@ -1,7 +1,7 @@
 """Actors and critics of the memory-based SAC agents (paper Appendix A, Figs. 9, 11, 13, 14).
 
 One convolutional trunk may look at the frames for all of them: then each branch begins with a layer of its own on the
-trunk's features, and psi is the trunk with the last layer of every memoryless branch.
+trunk's features, and psi is the trunk with the last layer of every memoryless branch, or the trunk alone.
 """
 
 import abc
@@ -114,11 +114,14 @@ class _WithTrunk(ActorCritic):
     """Looks through a trunk, if it has one."""
 
     trunk: Encoder | None
+    whole: bool  # whether its output layer belongs to the trunk too
 
     def look_at(self, frames: jax.Array) -> jax.Array:
         """(N, *observation_shape) -> (N, D) the trunk's features, or the frames."""
         seen = shown(frames, self.observation_spec)
-        return seen if self.trunk is None else self.trunk.body(seen)
+        if self.trunk is None:
+            return seen
+        return self.trunk(seen) if self.whole else self.trunk.body(seen)
 
 
 class TwoBranchActorCritic(_WithTrunk):

@@ -136,7 +136,7 @@ class TwoBranch(nn.Module):
     bottom_psi: bool  # the memoryless branch has psi's architecture, so that it can start from it
     predicts_state: bool = False  # the memory branch has a head that predicts z_s (the auxiliary task)
     predicts_itself: bool = False  # and one that predicts its own next summary (Eq. 6)
-    after_trunk: bool = False  # observations come as features of psi's body: only its output layer is left to do
+    after_trunk: bool = False  # observations come as features of a trunk: only a layer is left to do
 
     def setup(self) -> None:
         net, dtype = self.top.network, jnp.dtype(self.top.network.dtype)

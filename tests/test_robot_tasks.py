@@ -15,7 +15,17 @@ from envs_mjx import registry
 from envs_mjx.robot import BlockPulling, BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
 from envs_mjx.robot.planner import Planner, PlannerState, Trajectory, demonstrations
-from envs_mjx.robot.task import LEFT, NOT_FINITE, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotState, RobotTask
+from envs_mjx.robot.task import (
+    LEFT,
+    NOT_FINITE,
+    RUNNING,
+    STOPPED,
+    SUCCESS,
+    TIME_LIMIT,
+    RobotState,
+    RobotTask,
+    moments_in_view,
+)
 from envs_mjx.robot.trial import policy_trial
 from mijax.demonstrations import demonstrate
 
@@ -397,3 +407,15 @@ def test_a_trial_of_a_policy_tells_what_was_touched_first():
         if first is not None:
             assert played.movable_first is not None
             assert played.movable_first[number] == first
+
+
+def test_moments_tell_where_things_are_and_not_which_is_which():
+    near, far = np.array([0.03, -0.06]), np.array([-0.12, 0.1])
+    number, x, y, difference, product, total = np.asarray(moments_in_view(jnp.stack([near, far])))
+    np.testing.assert_allclose((number, x, y), (2.0, *(near + far)), atol=1e-6)
+    products = np.array([[total + difference, product], [product, total - difference]])  # 2 (a a^T + b b^T)
+    np.testing.assert_allclose(products - np.outer((x, y), (x, y)), np.outer(near - far, near - far), atol=1e-6)
+    np.testing.assert_allclose(moments_in_view(jnp.stack([far, near])), moments_in_view(jnp.stack([near, far])))
+    beyond = np.array([0.225, 0.0])
+    np.testing.assert_allclose(moments_in_view(jnp.stack([near, beyond])), moments_in_view(near[None]), atol=1e-6)
+    np.testing.assert_allclose(moments_in_view(jnp.array([[0.2, 0.0]]))[:2], [0.5, 0.1], atol=1e-6)

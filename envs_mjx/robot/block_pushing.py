@@ -7,7 +7,7 @@ from envs_mjx.base import Variable
 from envs_mjx.robot import depth, scene, window
 from envs_mjx.robot.blocks import Block, BlockTask, behind
 from envs_mjx.robot.plan import Plan, Stroke
-from envs_mjx.robot.task import RobotState, first_valid, where_in_view
+from envs_mjx.robot.task import RobotState, first_valid, moments_in_view
 from envs_mjx.robot.window import PAD_DEPTH, PAD_SIDE
 
 _ON_PAD = 0.05
@@ -32,7 +32,8 @@ class BlockPushing(BlockTask):
     opening, has_pad = window.TASKS[name]
     plan = Plan(hover=0.11, work=0.03, patience=2, retreat=(0.0, 0.0, 0.0, 0.0))
     block = Block(side=0.05, height=0.05, mass=0.02, friction=1.0)
-    variables = (*BlockTask.variables, Variable("pad x", hidden=False), Variable("pad y", hidden=False))
+    variables = (*BlockTask.variables,
+                 *(Variable(name, hidden=False) for name in ("pad seen", "pad x", "pad y")))
     reach = 0.05
     expert_noise = 0.15
     blocks_collide = True
@@ -62,8 +63,9 @@ class BlockPushing(BlockTask):
         return Stroke(begin, goal - _SHORT_OF_PAD * forth, forth)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(10,) float32: as of every task, and where the pad is from the gripper, 0 where out of view. Metres."""
-        return jnp.concatenate([super().ground_truth(env_state), where_in_view(env_state.goal - env_state.qpos[:2])])
+        """(13,) float32: as of every task, and whether the pad is in view and where. Metres."""
+        pad = moments_in_view((env_state.goal - env_state.qpos[:2])[None])
+        return jnp.concatenate([super().ground_truth(env_state), pad[:3]])
 
     def ground(self, env_state: RobotState) -> jax.Array:
         """(84, 84): the table at 0, the pad 2 cm deeper so that it can be seen."""

@@ -29,6 +29,8 @@ OUTCOMES = ("running", "success", "left the workspace", "not finite", "time limi
 """What `RobotState.outcome` counts."""
 RUNNING, SUCCESS, LEFT, NOT_FINITE, TIME_LIMIT, STOPPED = range(6)
 
+_FADE = 0.04
+"""Metres at the border of the window, half of them inside, over which what is declared to be in view fades."""
 CONTRAST = 0.05
 """Metres: the height of an object, against depths that shift by four times as much when the gripper rises. The fingers,
 painted 0, still tell how high it is."""
@@ -83,7 +85,8 @@ class RobotTask(Environment):
     """Standard deviation of what is added to the actions of demonstrations, in fractions of the largest action."""
     variables = (Variable("nearer moves", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in (
-                     "height", "turn cos", "turn sin", "nearer x", "nearer y", "farther x", "farther y")))
+                     "height", "turn cos", "turn sin", "objects seen", "objects x", "objects y",
+                     "objects xx-yy", "objects 2xy", "objects xx+yy")))
 
     def __init__(self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None) -> None:
         """Options that make a policy fit for a robot.
@@ -249,24 +252,34 @@ class RobotTask(Environment):
         return dataclasses.replace(turned, noise_key=noise_key), rotation.rotate_action(action, angle)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(8,) float32: whether the nearer object is the movable one; the gripper's height; cosine and sine of twice
-        its yaw, as it looks the same after half a turn; where both objects are from it, 0 where out of view. Metres.
+        """(10,) float32: whether the nearer object is the movable one; the gripper's height; cosine and sine of twice
+        its yaw, as it looks the same after half a turn; the `moments_in_view` of both objects. Metres.
         """
         offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
-        order = jnp.argsort(jnp.sum(jnp.square(offsets), axis=1))
+        nearer = jnp.argmin(jnp.sum(jnp.square(offsets), axis=1))
         turn = 2 * env_state.qpos[3]
         return jnp.concatenate([
-            (order[0] == env_state.movable).astype(jnp.float32)[None], env_state.qpos[2:3],
-            jnp.stack([jnp.cos(turn), jnp.sin(turn)]), *(where_in_view(offset) for offset in offsets[order])])
+            (nearer == env_state.movable).astype(jnp.float32)[None], env_state.qpos[2:3],
+            jnp.stack([jnp.cos(turn), jnp.sin(turn)]), moments_in_view(offsets)])
 
     def reveals(self, env_state: RobotState) -> jax.Array:
         """() bool: whether an object has been touched, from when on what is seen can tell which one moves."""
         return env_state.touched
 
 
-def where_in_view(offset: jax.Array) -> jax.Array:
-    """(2,) x, y from the gripper as they are within its window, 0 elsewhere."""
-    return jnp.where(jnp.max(jnp.abs(offset)) < depth.WINDOW / 2, offset, 0.0)
+def moments_in_view(offsets: jax.Array) -> jax.Array:
+    """How many of the things at (N, 2) `offsets` from the gripper are in its window, and sums over them: (6,) float32
+    N, x, y, xx - yy, 2xy, xx + yy.
+
+    These tell where two equal things are without calling one of them the first, and have no jumps, neither where both
+    are equally near nor at the window's edge, where a thing fades over `_FADE`. Asked for the nearer and the farther
+    one in their places, psi was off by 24 and 50 mm in a tenth of images, and what imitates on its body solved less of
+    Block-Pushing (results/robots).
+    """
+    x, y = offsets[:, 0], offsets[:, 1]
+    outside = jnp.maximum(jnp.abs(x), jnp.abs(y)) - depth.WINDOW / 2
+    weight = jnp.clip(0.5 - outside / _FADE, 0.0, 1.0)
+    return jnp.stack([jnp.ones_like(x), x, y, x * x - y * y, 2 * x * y, x * x + y * y]) @ weight
 
 
 def turn_common(env_state: RobotState, angle: jax.Array) -> RobotState:

@@ -93,6 +93,15 @@ def test_every_shape_has_an_encoder_and_its_first_block_leads_to_it(shape):
     np.testing.assert_allclose(evaluate(encoder, params, x[None]), z[None], atol=1e-6)
 
 
+def test_blank_channels_are_not_looked_at():
+    """With them or without, an encoder says the same: depths relative to their mean would fill them otherwise."""
+    spec = ArraySpec((84, 84, 2), blank=1, contrast=0.05)
+    encoder, x = encoder_for(spec, 8), jax.random.uniform(jax.random.key(1), (2, 84, 84, 2)).at[..., 1].set(0.0)
+    params: Any = encoder.init(jax.random.key(0), x)["params"]
+    whole, shown = (encoder.apply({"params": params}, images) for images in (x, x[..., :1]))
+    np.testing.assert_array_equal(whole, shown)
+
+
 def test_contrast_hides_the_level_of_an_image():
     shape = (52, 52, 2)
     x = jnp.asarray(np.random.default_rng(0).normal(size=(2, *shape)), jnp.float32)

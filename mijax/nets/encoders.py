@@ -133,6 +133,7 @@ class ImageEncoder(nn.Module):
     dtype: jnp.dtype = jnp.float32
     channels: int | None = None  # of the images; of these the last may be left out where they are always 0
     contrast: float = 0.0  # see `ArraySpec`
+    blank: int = 0  # last channels that are always 0: not looked at, as depths relative to a mean would fill them
 
     def setup(self) -> None:
         inputs = (self.channels, *(None for _ in self.plan[1:]))
@@ -152,6 +153,8 @@ class ImageEncoder(nn.Module):
 
     def first_block(self, x: Frames) -> Frames:
         """(..., rows, columns, channels) -> (..., rows', columns', channels'): what the discriminator shares."""
+        if self.blank and isinstance(x, jax.Array) and x.shape[-1] == self.channels:
+            x = x[..., : -self.blank]
         if self.contrast > 0:
             assert isinstance(x, jax.Array)
             x = about_mean(x, self.contrast)
@@ -203,7 +206,7 @@ def _fits(plan: Sequence[ConvBlock], size: int) -> bool:
 def encoder_for(spec: ArraySpec, features: int, dtype: jnp.dtype = jnp.float32) -> Encoder:
     """The encoder of arrays like `spec`: vectors (D,) or images (rows, columns, channels)."""
     if spec.is_image:
-        return ImageEncoder(image_plan(min(spec.shape[:2])), features, dtype, spec.shape[2], spec.contrast)
+        return ImageEncoder(image_plan(min(spec.shape[:2])), features, dtype, spec.shape[2], spec.contrast, spec.blank)
     if len(spec.shape) == 1:
         return VectorEncoder(hidden=VECTOR_HIDDEN, features=features, dtype=dtype)
     raise ValueError(f"no encoder for arrays of shape {spec.shape}: vectors (D,) and images (rows, columns, channels)")

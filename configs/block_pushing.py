@@ -2,8 +2,7 @@
 
     python -m mijax.train --domain block_pushing
 
-Not solved: 0.75 after a fifth of a run, one seed (results/robots): pad and other cube are out of view a third of the
-time, and have to be remembered. Forty minutes of one core.
+Not solved: 0.79 at best, one seed (results/robots). Forty minutes of one core.
 """
 
 from configs.robots import robot

@@ -63,7 +63,7 @@ class BlockPushing(BlockTask):
         return Stroke(begin, goal - _SHORT_OF_PAD * forth, forth)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(13,) float32: as of every task, and whether the pad is in view and where. Metres."""
+        """(13,) float32: as of both tasks with blocks, and whether the pad is in view and where. Metres."""
         pad = moments_in_view((env_state.goal - env_state.qpos[:2])[None])
         return jnp.concatenate([super().ground_truth(env_state), pad[:3]])
 

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs_mjx.base import Variable
 from envs_mjx.robot import depth, scene
 from envs_mjx.robot.rotation import mirror_poses, turn_poses, turn_vectors
-from envs_mjx.robot.task import RobotState, RobotTask, turn_common
+from envs_mjx.robot.task import RobotState, RobotTask, moments_in_view, turn_common
 
 _BEHIND = 0.08
 
@@ -31,6 +32,8 @@ class BlockTask(RobotTask):
     reach: float
     """How far the loose block's middle may leave the workspace, metres."""
     blocks_collide: bool
+    variables = (*RobotTask.variables,
+                 *(Variable(name, hidden=False) for name in ("objects seen", "turn cos", "turn sin")))
     placed = ("fixed",)
 
     def xml(self, visual: bool = False) -> str:
@@ -88,6 +91,15 @@ class BlockTask(RobotTask):
         return dataclasses.replace(
             mirrored, qpos=mirrored.qpos.at[4:].set(mirror_poses(env_state.qpos[4:])),
             qvel=mirrored.qvel.at[jnp.array([5, 6])].multiply(-1))
+
+    def ground_truth(self, env_state: RobotState) -> jax.Array:
+        """(10,) float32: as of every task, how many blocks are in view, and cosine and sine of twice the gripper's yaw,
+        as it looks the same after half a turn. (Drawers are always in view, and the closed gripper shows no yaw.)
+        """
+        seen = moments_in_view(self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2])[:1]
+        turn = 2 * env_state.qpos[3]
+        return jnp.concatenate([
+            super().ground_truth(env_state), seen, jnp.stack([jnp.cos(turn), jnp.sin(turn)])])
 
     def heights(self, env_state: RobotState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Heights of the loose block, the fixed block, and the ground, each (84, 84)."""

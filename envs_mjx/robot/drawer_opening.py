@@ -92,7 +92,7 @@ class DrawerOpening(RobotTask):
         return jnp.concatenate([env_state.poses[:, :2] - before[:, None] * direction, yaw[:, None]], axis=1)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(12,) float32: as of every task, and cosine and sine of the way from the handles to the cabinets."""
+        """(9,) float32: as of every task, and cosine and sine of the way from the handles to the cabinets."""
         rot = env_state.poses[0, 2]
         return jnp.concatenate([super().ground_truth(env_state), jnp.stack([jnp.cos(rot), jnp.sin(rot)])])
 

@@ -85,8 +85,7 @@ class RobotTask(Environment):
     """Standard deviation of what is added to the actions of demonstrations, in fractions of the largest action."""
     variables = (Variable("nearer moves", hidden=True, num_values=2),
                  *(Variable(name, hidden=False) for name in (
-                     "height", "turn cos", "turn sin", "objects seen", "objects x", "objects y",
-                     "objects xx-yy", "objects 2xy", "objects xx+yy")))
+                     "height", "objects x", "objects y", "objects xx-yy", "objects 2xy", "objects xx+yy")))
 
     def __init__(self, noise: float = 0.0, stop_force: float = 0.0, expert_noise: float | None = None) -> None:
         """Options that make a policy fit for a robot.
@@ -252,15 +251,13 @@ class RobotTask(Environment):
         return dataclasses.replace(turned, noise_key=noise_key), rotation.rotate_action(action, angle)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
-        """(10,) float32: whether the nearer object is the movable one; the gripper's height; cosine and sine of twice
-        its yaw, as it looks the same after half a turn; the `moments_in_view` of both objects. Metres.
+        """(7,) float32: whether the nearer object is the movable one; the gripper's height; the `moments_in_view` of
+        both objects but for their number. Metres.
         """
         offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
         nearer = jnp.argmin(jnp.sum(jnp.square(offsets), axis=1))
-        turn = 2 * env_state.qpos[3]
         return jnp.concatenate([
-            (nearer == env_state.movable).astype(jnp.float32)[None], env_state.qpos[2:3],
-            jnp.stack([jnp.cos(turn), jnp.sin(turn)]), moments_in_view(offsets)])
+            (nearer == env_state.movable).astype(jnp.float32)[None], env_state.qpos[2:3], moments_in_view(offsets)[1:]])
 
     def reveals(self, env_state: RobotState) -> jax.Array:
         """() bool: whether an object has been touched, from when on what is seen can tell which one moves."""

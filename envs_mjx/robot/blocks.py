@@ -96,7 +96,7 @@ class BlockTask(RobotTask):
         """(10,) float32: as of every task, how many blocks are in view, and cosine and sine of twice the gripper's yaw,
         as it looks the same after half a turn. (Drawers are always in view, and the closed gripper shows no yaw.)
         """
-        seen = moments_in_view(self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2])[:1]
+        seen = moments_in_view(self.object_offsets(env_state))[:1]
         turn = 2 * env_state.qpos[3]
         return jnp.concatenate([
             super().ground_truth(env_state), seen, jnp.stack([jnp.cos(turn), jnp.sin(turn)])])

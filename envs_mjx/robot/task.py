@@ -254,10 +254,14 @@ class RobotTask(Environment):
         """(7,) float32: whether the nearer object is the movable one; the gripper's height; the `moments_in_view` of
         both objects but for their number. Metres.
         """
-        offsets = self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
+        offsets = self.object_offsets(env_state)
         nearer = jnp.argmin(jnp.sum(jnp.square(offsets), axis=1))
         return jnp.concatenate([
             (nearer == env_state.movable).astype(jnp.float32)[None], env_state.qpos[2:3], moments_in_view(offsets)[1:]])
+
+    def object_offsets(self, env_state: RobotState) -> jax.Array:
+        """(2, 2) x, y of both objects from the gripper, metres."""
+        return self.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]
 
     def reveals(self, env_state: RobotState) -> jax.Array:
         """() bool: whether an object has been touched, from when on what is seen can tell which one moves."""

@@ -417,5 +417,6 @@ def test_moments_tell_where_things_are_and_not_which_is_which():
     np.testing.assert_allclose(products - np.outer((x, y), (x, y)), np.outer(near - far, near - far), atol=1e-6)
     np.testing.assert_allclose(moments_in_view(jnp.stack([far, near])), moments_in_view(jnp.stack([near, far])))
     beyond = np.array([0.225, 0.0])
-    np.testing.assert_allclose(moments_in_view(jnp.stack([near, beyond])), moments_in_view(jnp.asarray(near)[None]), atol=1e-6)
+    alone = moments_in_view(jnp.asarray(near)[None])
+    np.testing.assert_allclose(moments_in_view(jnp.stack([near, beyond])), alone, atol=1e-6)
     np.testing.assert_allclose(moments_in_view(jnp.array([[0.2, 0.0]]))[:2], [0.5, 0.1], atol=1e-6)

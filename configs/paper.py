@@ -44,7 +44,7 @@ def paper(config: Config, vector_observation: bool) -> Config:
         config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(domain, 10.0),
         intrinsic_form="cosine")
     stage1 = dataclasses.replace(
-        config.stage1, epochs=EPOCHS, rewarded=0, club_ramp=0.0, phi_shrinkage=0.0, lower_bound="jensen_shannon",
-        **TABLE_3.get(domain, {}))
+        config.stage1, epochs=EPOCHS, rewarded=0, club_ramp=0.0, warmup=0.0, phi_shrinkage=0.0,
+        lower_bound="jensen_shannon", **TABLE_3.get(domain, {}))
     return dataclasses.replace(config, steps=steps, network=network, dqn=dqn, sac=sac, information=information,
                                stage1=stage1)

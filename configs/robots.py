@@ -46,7 +46,7 @@ def robot(
         num_envs=2,
         stage1=Stage1Config(data="demonstrations", episodes=80, heldout_episodes=80, copies=copies, epochs=epochs,
                             batch_size=100, learning_rate=2e-3, rewarded=20, lambda_r=10.0, lambda_s=0.1, lambda_o=1.0,
-                            lambda_club=lambda_club, club_ramp=0.8, lambda_dim_s=0.1, lambda_dim_o=1.0,
+                            lambda_club=lambda_club, club_ramp=0.8, warmup=0.1, lambda_dim_s=0.1, lambda_dim_o=1.0,
                             lower_bound=lower_bound, phi_shrinkage=0.0),
         network=NetworkConfig(action_embedding=16, observation_embedding=64, dropout=0.0),
         sac=SACConfig(trunk="psi", learning_rate=1e-3, final_learning_rate=0.05, trace_decay=0.8, target_rate=0.01,

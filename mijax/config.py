@@ -61,6 +61,9 @@ class Stage1Config:
     """Transitions per update; the last partial batch of an epoch is dropped."""
     learning_rate: float = 3e-3
     """Adam step size of phi, psi, the dynamics model and the estimator of CLUB."""
+    warmup: float = 0.0
+    """Fraction of training over which that of the first three rises from 0. Adam's first steps are as long as any, in
+    directions of single batches; on camera images they can spoil psi for good, by luck of its start."""
     features: int = 32
     """Width of z_s and of z_o."""
     lambda_r: float = 10.0
@@ -106,6 +109,7 @@ class Stage1Config:
                 "at least 2: probes are fitted on one half and scored on the other")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
         require(0 <= self.club_ramp <= 1, "stage1.club-ramp", self.club_ramp, "a number in [0, 1]")
+        require(0 <= self.warmup < 1, "stage1.warmup", self.warmup, "a number in [0, 1)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,6 +248,9 @@ class SACConfig:
     imitate_successes: bool = False
     """Whether the mean also comes near the actions of the agent's own episodes that return as much as the median
     demonstration: 80 demonstrations show few scenes. The scale keeps to the demonstrations."""
+    greedy_environments: int = 0
+    """In how many of the environments the agent acts by its mean action while it learns (paper: 0): as it is evaluated.
+    Where the mean action leads nowhere, noise hides it; the critics never see how such an episode ends."""
     rotated_copies: int = 0
     """Copies of each episode, moved by a symmetry of the task that is drawn once per copy, that are sampled beside the
     original (paper: 4 on the robots)."""
@@ -260,7 +267,8 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         _require_at_least("sac.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes")
-        _require_at_least("sac.", self, 0, "demonstrations", "rotated_copies", "pretrain_updates", "imitation_weight")
+        _require_at_least("sac.", self, 0, "demonstrations", "rotated_copies", "pretrain_updates", "imitation_weight",
+                          "greedy_environments")
         for name in ("learning_rate", "updates_per_step", "initial_temperature"):
             require(getattr(self, name) > 0, f"sac.{name}".replace("_", "-"), getattr(self, name), "a number > 0")
         require(self.batch_episodes % 2 == 0, "sac.batch-episodes", self.batch_episodes, "an even number")
@@ -419,6 +427,8 @@ class Config:
         steps = self.iteration_steps
         require(self.evaluation.every % steps == 0, "evaluation.every", self.evaluation.every,
                 f"a multiple of num-envs x steps-per-iteration = {steps}")
+        require(self.sac.greedy_environments < self.num_envs, "sac.greedy-environments", self.sac.greedy_environments,
+                f"a number below num-envs = {self.num_envs}")
 
     @property
     def iteration_steps(self) -> int:

@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import json
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from mijax.representation.model import evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
 from mijax.representation.problem import Problem
 from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
-from mijax.representation.train import EstimatorState, club_growth, encode, shrink
+from mijax.representation.train import ENCODER_NETWORKS, EstimatorState, club_growth, encode, optimizers, shrink
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
 
@@ -128,6 +128,23 @@ def test_shrinking_stops_at_zero_and_spares_biases():
     updates: Any = transform.update(still, transform.init(weights), weights)[0]
     np.testing.assert_allclose(weights["kernel"] + updates["kernel"], [[0.9, 0.0, -0.2]], atol=1e-6)
     np.testing.assert_array_equal(updates["bias"], [0.0])
+
+
+@pytest.mark.lenient
+def test_the_step_size_rises_over_the_warm_up_and_falls_to_nothing():
+    def steps(warmup: float) -> list[float]:
+        config = Stage1Config(warmup=warmup, learning_rate=0.1)
+        optimizer, _ = optimizers(config, 10, 0.0)
+        params: Any = {name: jnp.zeros(()) for name in ENCODER_NETWORKS}
+        state, taken = optimizer.init(params), []
+        for _ in range(10):
+            update, state = optimizer.update(jax.tree.map(jnp.ones_like, params), state, params)
+            taken.append(-float(cast(dict, update)["psi"]))
+        return taken
+
+    np.testing.assert_allclose(steps(0.4)[:5], [0.0, 0.025, 0.05, 0.075, 0.1], atol=1e-6)
+    assert 0 < steps(0.4)[-1] < 0.01
+    np.testing.assert_allclose(steps(0.0)[0], 0.1, rtol=1e-5)
 
 
 @pytest.mark.lenient

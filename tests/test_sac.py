@@ -286,6 +286,21 @@ def test_step_by_step_equals_the_full_pass(name: str, memory: Any):
             np.testing.assert_allclose(action[0], np.tanh(mean[row, t]), atol=2e-5)
 
 
+def test_the_first_environments_may_be_greedy():
+    """They act by the mean, the others around it; all act at random in the warm-up."""
+    case = Case("base", num_envs=3, sac=dataclasses.replace(CONFIG.sac, greedy_environments=2),
+                evaluation=EvaluationConfig(every=9))
+    frames, none = jnp.ones((3, 2)), case.agent.no_action(3)
+    small = jax.tree.map(lambda x: x / 10, case.params)  # a mean that tanh does not round to 1
+    arguments = small, case.agent.initial_memory(3), frames, none
+    greedy, explore = jax.jit(case.agent.act)(*arguments)[1], jax.jit(case.agent.explore)
+    _, action = explore(*arguments, jnp.float32(0), jax.random.key(0))
+    np.testing.assert_allclose(action[:2], greedy[:2], atol=1e-6)
+    assert np.max(np.abs(action[2] - greedy[2])) > 1e-3
+    _, action = explore(*arguments, jnp.float32(1), jax.random.key(0))
+    assert len(np.unique(action)) == action.size
+
+
 @pytest.mark.parametrize("name", ["base", "ua"])
 def test_the_value_of_a_beginning(name: str):
     """The smaller critic's, of the mean action at the first token; unknown where the critics want the state."""
@@ -342,6 +357,7 @@ def test_titles_follow_the_algorithm():
     ({"pretrain_updates": 9}, "--sac.pretrain-updates: got 9, accepted: 0, unless there are --sac.demonstrations"),
     ({"imitate_successes": True},
      "--sac.imitate-successes: got True, accepted: False, unless there is an --sac.imitation-weight"),
+    ({"greedy_environments": 2}, "--sac.greedy-environments: got 2, accepted: a number below num-envs = 2"),
     ({"batch_episodes": 7}, "--sac.batch-episodes: got 7, accepted: an even number"),
     ({"initial_temperature": 0.0}, "--sac.initial-temperature: got 0.0, accepted: a number > 0"),
 ])

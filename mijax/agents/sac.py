@@ -150,10 +150,13 @@ class SAC(Agent):
         self, params: Params, memory: MemoryState, observation: jax.Array, previous_action: jax.Array,
         epsilon: jax.Array, key: jax.Array,
     ) -> tuple[MemoryState, jax.Array]:
-        """A draw from the actor; uniform in [-1, 1] with probability `epsilon` (the warm-up)."""
+        """A draw from the actor, or its mean in the greedy environments, which are the first; uniform in [-1, 1] with
+        probability `epsilon` (the warm-up)."""
         memory, mean, log_scale = self._call("step", params, memory, observation, previous_action)
         key_gate, key_uniform, key_noise = jax.random.split(key, 3)
-        drawn = jnp.tanh(mean + jnp.exp(log_scale) * jax.random.normal(key_noise, mean.shape))
+        draws = jnp.arange(mean.shape[0])[:, None] >= self.options.greedy_environments
+        noise = jnp.where(draws, jax.random.normal(key_noise, mean.shape), 0.0)
+        drawn = jnp.tanh(mean + jnp.exp(log_scale) * noise)
         uniform = jax.random.uniform(key_uniform, mean.shape, minval=-1.0, maxval=1.0)
         return memory, jnp.where(jax.random.uniform(key_gate, (mean.shape[0], 1)) < epsilon, uniform, drawn)
 

@@ -130,10 +130,13 @@ class History:
 def optimizers(
     config: Stage1Config, updates: int, phi_shrinkage: Weight
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Adam for the encoders and the dynamics model, its step size falling to 0 as a half cosine, with the shrinkage of
-    phi; and Adam at a constant step size for the estimator, which has to follow to the end.
+    """Adam for the encoders and the dynamics model, its step size falling to 0 as a half cosine, after a rise if there
+    is a warm-up, with the shrinkage of phi; and Adam at a constant step size for the estimator, which has to follow to
+    the end.
     """
     step_size = optax.cosine_decay_schedule(config.learning_rate, updates)
+    if rise := round(config.warmup * updates):
+        step_size = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, rise, updates)
     plain = optax.adam(step_size)
     names = {name: "phi" if name == "phi" else "others" for name in ENCODER_NETWORKS}
     shrinking = optax.chain(plain, shrink(phi_shrinkage, step_size))

@@ -239,12 +239,12 @@ class SACConfig:
     """Updates on the demonstrations, and the few random episodes, before the agent acts (paper: 0); rounded up to what
     belongs to num-envs x steps-per-iteration steps."""
     imitation_weight: float = 0.0
-    """Weight of the loss that brings the actor's mean action near a demonstration's, and its scale to the distance
-    that is left (paper: 0)."""
+    """Weight of the squared distance of the actor's mean action from a demonstration's (paper: 0). With any, its scale
+    is fitted to the distance that is left, with weight 1."""
     imitation_until: float = 1.0
-    """Fraction of the run's updates over which that weight falls linearly ..."""
+    """Fraction of the run's updates over which both weights fall linearly ..."""
     imitation_final: float = 0.0
-    """... to this fraction of itself, which stays."""
+    """... to this fraction of themselves, which stays."""
     imitate_successes: bool = False
     """Whether the mean also comes near the actions of the agent's own episodes that return as much as the median
     demonstration: 80 demonstrations show few scenes. The scale keeps to the demonstrations."""

@@ -93,7 +93,8 @@ def test_imitation_fits_the_scale_to_what_is_left():
     shown, mask = jnp.array([[0.3], [-0.3]]), jnp.ones((2,), bool)
 
     def loss(action: float, log_scale: float) -> jax.Array:
-        return sac.imitation_loss(jnp.full((2, 1), action), jnp.full((2, 1), log_scale), shown, mask)[0]
+        arguments = jnp.full((2, 1), action), jnp.full((2, 1), log_scale), shown, mask
+        return sac.imitation_loss(arguments[0], shown, mask) + sac.scale_loss(*arguments)
 
     gradients = [float(jax.grad(loss, argnums=1)(0.0, jnp.log(scale))) for scale in (0.2, 0.3, 0.4)]
     np.testing.assert_allclose(gradients, [0.2**2 - 0.3**2, 0, 0.4**2 - 0.3**2], atol=1e-6)
@@ -168,7 +169,7 @@ def check_losses(case: Case, updates: int, expected: dict[str, float], weights: 
 
 
 IMITATING = dataclasses.replace(
-    CONFIG.sac, demonstrations=1, imitation_weight=1.0, imitation_until=0.5, imitation_final=0.2)
+    CONFIG.sac, demonstrations=1, imitation_weight=3.0, imitation_until=0.5, imitation_final=0.2)
 
 
 @pytest.mark.parametrize("successes", [False, True])
@@ -190,12 +191,12 @@ def test_losses_by_hand_with_imitation(successes: bool):
     moves = distances(SPANS[0], SPANS[2])
     scales = np.array([log_scale[row, t] for row, first, end in (SPANS[0], SPANS[2]) for t in range(first, end - 1)])
     variances = np.exp(2 * scales)
-    misfit = np.mean(np.sum(variances * (moves**2 / (2 * variances) + scales), axis=-1))
+    expected["loss/scale"] = np.mean(np.sum(variances * (moves**2 / (2 * variances) + scales), axis=-1))
     expected["actor/distance"] = np.mean(np.sum(moves**2, axis=-1))
     near = distances(*SPANS) if successes else moves
-    expected["loss/imitation"] = np.mean(np.sum(near**2, axis=-1)) + misfit
+    expected["loss/imitation"] = np.mean(np.sum(near**2, axis=-1))
     quarter = case.config.sac.updates_in(CONFIG.steps) // 4  # half of the way from 1 to 0.2
-    check_losses(case, quarter, expected, {"loss/imitation": 0.6})
+    check_losses(case, quarter, expected, {"loss/imitation": 3.0 * 0.6, "loss/scale": 0.6})
 
 
 def test_losses_and_bonus_of_ours_by_hand():

@@ -59,11 +59,11 @@ class SAC(Agent):
         """In nats, of all dimensions."""
         return self.options.target_entropy * self.network.action_size
 
-    def imitation_weight(self, updates: jax.Array) -> jax.Array:
-        """() weight of the demonstrations' actions after so many updates."""
+    def imitation_fade(self, updates: jax.Array) -> jax.Array:
+        """() share of its weight that imitation has after so many updates."""
         options = self.options
-        fade = optax.linear_schedule(options.imitation_weight, options.imitation_weight * options.imitation_final,
-                                     max(1, round(options.imitation_until * options.updates_in(self.config.steps))))
+        over = max(1, round(options.imitation_until * options.updates_in(self.config.steps)))
+        fade = optax.linear_schedule(1.0, options.imitation_final, over)
         return jnp.asarray(fade(updates), jnp.float32)
 
     def init_network(self, key: jax.Array) -> Params:
@@ -191,9 +191,10 @@ class SAC(Agent):
         loss_actor, log_prob, parts = self._actor(agent, online, log_temperature, tokens, key_action)
         loss, metrics = loss + loss_actor, metrics | parts
         if tokens.demonstrated is not None:
-            loss_imitation, parts = self._imitation(agent, online, tokens)
-            loss += self.imitation_weight(updates) * loss_imitation
-            metrics |= {"loss/imitation": loss_imitation, "actor/distance": parts["distance"]}
+            loss_imitation, loss_scale, parts = self._imitation(agent, online, tokens)
+            fade = self.imitation_fade(updates)
+            loss += fade * (self.options.imitation_weight * loss_imitation + loss_scale)
+            metrics |= parts
         next_action, next_log_prob = self._draw(agent, steady.actor, key_next)
         q_next = jnp.min(self._call("values", target, averaged.critic, next_action), axis=0)
         soft_value = (q_next - jnp.exp(log_temperature) * next_log_prob).reshape(tokens.segment.shape)
@@ -233,14 +234,19 @@ class SAC(Agent):
         loss = sac.actor_loss(log_prob, q, jnp.exp(log_temperature), transitions(tokens))
         return loss, log_prob, {"loss/actor": loss}
 
-    def _imitation(self, agent: Params, online: Encoded, tokens: Tokens) -> tuple[jax.Array, Metrics]:
-        """The loss over the transitions of what is imitated, and how far the mean is from demonstrations."""
+    def _imitation(self, agent: Params, online: Encoded, tokens: Tokens) -> tuple[jax.Array, jax.Array, Metrics]:
+        """The losses of the mean, over the transitions of what is imitated, and of the scale, over those of
+        demonstrations: it does not fit itself to episodes that the actor drew from it."""
         mean, log_scale = (
             x.reshape(*tokens.segment.shape, -1)[:, :-1] for x in self._call("policy", agent, online.actor))
-        demonstrated, succeeded = (
-            None if of is None else transitions(tokens) & of[:, :-1] for of in (tokens.demonstrated, tokens.succeeded))
-        intended = cast(jax.Array, tokens.intended)[:, 1:]
-        return sac.imitation_loss(jnp.tanh(mean), log_scale, intended, cast(jax.Array, demonstrated), succeeded)
+        valid, action, intended = transitions(tokens), jnp.tanh(mean), cast(jax.Array, tokens.intended)[:, 1:]
+        near = demonstrated = valid & cast(jax.Array, tokens.demonstrated)[:, :-1]
+        if tokens.succeeded is not None:
+            near |= valid & tokens.succeeded[:, :-1]
+        loss, loss_scale = (sac.imitation_loss(action, intended, near),
+                            sac.scale_loss(action, log_scale, intended, demonstrated))
+        return loss, loss_scale, {"loss/imitation": loss, "loss/scale": loss_scale,
+                                  "actor/distance": sac.imitation_loss(action, intended, demonstrated)}
 
     def _critic(
         self, agent: Params, online: Encoded, soft_value: jax.Array, bonus: jax.Array, tokens: Tokens

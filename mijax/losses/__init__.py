@@ -13,7 +13,14 @@ from mijax.losses.information import (
 )
 from mijax.losses.masks import masked_mean
 from mijax.losses.returns import traced_returns
-from mijax.losses.sac import actor_loss, critic_loss, imitation_loss, sample_tanh_gaussian, temperature_loss
+from mijax.losses.sac import (
+    actor_loss,
+    critic_loss,
+    imitation_loss,
+    sample_tanh_gaussian,
+    scale_loss,
+    temperature_loss,
+)
 from mijax.losses.td import double_q_value, td_loss
 from mijax.losses.variables import variables_loss
 
@@ -38,6 +45,7 @@ __all__ = [
     "prediction_mse",
     "reward_loss",
     "sample_tanh_gaussian",
+    "scale_loss",
     "td_loss",
     "temperature_loss",
     "traced_returns",

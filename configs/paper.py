@@ -29,8 +29,8 @@ def paper(config: Config, vector_observation: bool) -> Config:
     domain = plain_name(config.domain)
     steps = STEPS.get(domain, 500_000)
     network = dataclasses.replace(
-        config.network, gru_width=128, critic_hidden=(256, 256), actor_hidden=(256, 256), auxiliary_hidden=(128, 128),
-        dropout=0.1, action_embedding=64 if vector_observation else 16,
+        config.network, layers=1, gru_width=128, critic_hidden=(256, 256), actor_hidden=(256, 256),
+        auxiliary_hidden=(128, 128), dropout=0.1, action_embedding=64 if vector_observation else 16,
         observation_embedding=64 if vector_observation or domain in ROBOTS else 100)
     dqn = dataclasses.replace(
         config.dqn, learning_rate=CRITIC_LEARNING_RATE.get(domain, 3e-4), final_learning_rate=1.0, discount=0.99,
@@ -39,7 +39,8 @@ def paper(config: Config, vector_observation: bool) -> Config:
     sac = dataclasses.replace(
         config.sac, learning_rate=3e-4, final_learning_rate=1.0, discount=0.99, trace_decay=0.0, target_rate=0.005,
         batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0,
-        pretrain_updates=0, imitation_weight=0.0, imitate_successes=False, rotated_copies=4, replay_steps=100_000)
+        pretrain_updates=0, imitation_weight=0.0, imitate_successes=False, greedy_environments=0, rotated_copies=4,
+        replay_steps=100_000)
     information = dataclasses.replace(
         config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(domain, 10.0),
         intrinsic_form="cosine")

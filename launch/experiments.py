@@ -107,7 +107,8 @@ def parts(domain: str) -> dict[str, tuple[Arm, ...]]:
         without("auxiliary", "auxiliary task", "#009E73", "--information.auxiliary-weight", "0"),
         without("intrinsic", "intrinsic reward", "#CC79A7", "--information.intrinsic-weight", "0"),
         without("psi", "psi", "#555555", "--sac.trunk", "shared", "--information.no-start-from-psi"),
-        without("imitation", "imitation", "#D55E00", "--sac.pretrain-updates", "0", "--sac.imitation-weight", "0"))}
+        without("imitation", "imitation", "#D55E00", "--sac.pretrain-updates", "0", "--sac.imitation-weight", "0",
+                "--sac.no-imitate-successes"))}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,7 @@ class BlockPushing(BlockTask):
     variables = (*BlockTask.variables,
                  *(Variable(name, hidden=False) for name in ("pad seen", "pad x", "pad y")))
     reach = 0.05
-    expert_noise = 0.15
+    expert_noise = 0.3
     blocks_collide = True
 
     def draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:

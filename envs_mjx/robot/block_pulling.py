@@ -23,7 +23,7 @@ class BlockPulling(BlockTask):
     name = "block_pulling"
     opening, has_pad = window.TASKS[name]
     plan = Plan(hover=0.1, work=0.03, patience=3, retreat=(0.0, 0.0, 1.0, 0.0))
-    expert_noise = 0.2
+    expert_noise = 0.35
     block = Block(side=0.10, height=0.05, mass=0.5, friction=0.5)
     reach = 0.0
     blocks_collide = False  # the episode ends when they touch

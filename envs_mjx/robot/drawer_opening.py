@@ -38,7 +38,7 @@ class DrawerOpening(RobotTask):
     name = "drawer_opening"
     opening, has_pad = window.TASKS[name]
     plan = Plan(hover=0.11, work=0.01, patience=3, retreat=(0.0, 0.0, 1.0, 0.0))
-    expert_noise = 0.2
+    expert_noise = 0.3
     variables = (*RobotTask.variables, Variable("rot cos", hidden=False), Variable("rot sin", hidden=False))
     placed = ("loose", "fixed")
 

@@ -48,7 +48,7 @@ def robot(
                               dropout=0.0),
         sac=SACConfig(trunk="z_o", learning_rate=1e-3, final_learning_rate=0.05, trace_decay=0.8, target_rate=0.01,
                       updates_per_step=0.5, replay_steps=50_000, demonstrations=80, demonstration_share=0.25,
-                      pretrain_updates=2000, imitation_weight=10.0, imitation_final=0.3, imitate_successes=True,
+                      pretrain_updates=2000, imitation_weight=30.0, imitation_final=0.3, imitate_successes=True,
                       greedy_environments=1, rotated_copies=24),
         zp=SelfPredictionConfig(weight=0.1),
         # The paper's weight of 0.1 paid up to 0.35 for an episode of moving about, as z_s holds what moves too: a

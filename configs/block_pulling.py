@@ -2,7 +2,8 @@
 
     python -m mijax.train --domain block_pulling
 
-Measurements: results/robots.
+Success 0.982 of 500 episodes, one seed (results/robots). A quarter of an hour of one core, and five
+minutes for stage 1.
 """
 
 from configs.robots import robot

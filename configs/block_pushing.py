@@ -2,7 +2,8 @@
 
     python -m mijax.train --domain block_pushing
 
-Measurements: results/robots.
+Not solved: success 0.932 of 500 episodes, one seed (results/robots). Forty minutes of one
+core, six of them for stage 1.
 """
 
 from configs.robots import robot

@@ -3,7 +3,7 @@
     python -m mijax.train --domain block_pushing
 
 Not solved: success 0.932 of 500 episodes, one seed (results/robots). Forty minutes of one
-core, six of them for stage 1.
+core, and six for stage 1.
 """
 
 from configs.robots import robot

@@ -63,7 +63,7 @@ class Stage1Config:
     """Adam step size of phi, psi, the dynamics model and the estimator of CLUB."""
     warmup: float = 0.0
     """Fraction of training over which that of the first three rises from 0. Adam's first steps are as long as any, in
-    directions of single batches; on camera images they can spoil psi for good, by luck of its start."""
+    directions of single batches; on camera images they can set psi far back, by luck of its start."""
     features: int = 32
     """Width of z_s and of z_o."""
     lambda_r: float = 10.0

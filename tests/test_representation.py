@@ -145,6 +145,7 @@ def test_the_step_size_rises_over_the_warm_up_and_falls_to_nothing():
     np.testing.assert_allclose(steps(0.4)[:5], [0.0, 0.025, 0.05, 0.075, 0.1], atol=1e-6)
     assert 0 < steps(0.4)[-1] < 0.01
     np.testing.assert_allclose(steps(0.0)[0], 0.1, rtol=1e-5)
+    optimizers(Stage1Config(warmup=0.9), 1, 0.0)  # a single update, which nothing can rise over
 
 
 @pytest.mark.lenient

@@ -135,7 +135,7 @@ def optimizers(
     the end.
     """
     step_size = optax.cosine_decay_schedule(config.learning_rate, updates)
-    if rise := round(config.warmup * updates):
+    if rise := int(config.warmup * updates):  # fewer than all, which optax refuses
         step_size = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, rise, updates)
     plain = optax.adam(step_size)
     names = {name: "phi" if name == "phi" else "others" for name in ENCODER_NETWORKS}

@@ -8,4 +8,4 @@ core, and six for stage 1.
 
 from configs.robots import robot
 
-CONFIG = robot("block_pushing", copies=12, epochs=12, lambda_club=0.1, layers=2, observation_embedding=112)
+CONFIG = robot("block_pushing", copies=12, epochs=12, lambda_club=0.1)

@@ -21,10 +21,7 @@ from mijax.config import (
 )
 
 
-def robot(
-    domain: str, copies: int, epochs: int, lambda_club: float = 0.3, steps: int = 20_000, layers: int = 1,
-    observation_embedding: int = 64,
-) -> Config:
+def robot(domain: str, copies: int, epochs: int, lambda_club: float = 0.3, steps: int = 20_000) -> Config:
     """The preset of a robot task.
 
     Args:
@@ -33,8 +30,6 @@ def robot(
         epochs: of stage 1.
         lambda_club: at its full weight; 0.3 left nothing of z_s in Block-Pushing.
         steps: of the environment.
-        layers: transformer blocks.
-        observation_embedding: width of z_o in a token.
     """
     return Config(
         domain=domain,
@@ -44,8 +39,7 @@ def robot(
                             batch_size=100, learning_rate=2e-3, warmup=0.1, rewarded=20, lambda_r=10.0, lambda_s=0.1,
                             lambda_o=1.0, lambda_club=lambda_club, club_ramp=0.8, lambda_dim_s=0.1, lambda_dim_o=1.0,
                             lower_bound="variables", phi_shrinkage=0.0),
-        network=NetworkConfig(layers=layers, action_embedding=16, observation_embedding=observation_embedding,
-                              dropout=0.0),
+        network=NetworkConfig(layers=1, action_embedding=16, observation_embedding=64, dropout=0.0),
         sac=SACConfig(trunk="z_o", learning_rate=1e-3, final_learning_rate=0.05, trace_decay=0.8, target_rate=0.01,
                       updates_per_step=0.5, replay_steps=50_000, demonstrations=80, demonstration_share=0.25,
                       pretrain_updates=2000, imitation_weight=30.0, imitation_final=0.3, imitate_successes=True,

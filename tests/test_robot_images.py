@@ -283,8 +283,8 @@ def test_augmenting_turns_moments_and_actions_alike(env: RobotTask) -> None:
 def test_turned_actions() -> None:
     action = jnp.array([0.6, 0.2, -0.3, 0.9])
     np.testing.assert_allclose(rotate_action(action, jnp.float32(np.pi / 2)), [-0.2, 0.6, -0.3, 0.9], atol=1e-6)
-    np.testing.assert_allclose(rotate_action(jnp.array([1.0, 1.0, 0.0, 0.0]), jnp.float32(np.pi / 4)), [0, 1, 0, 0],
-                               atol=1e-6)
+    np.testing.assert_allclose(rotate_action(jnp.array([1.0, 1.0, 0.0, 0.0]), jnp.float32(np.pi / 4)),
+                               [0, np.sqrt(2), 0, 0], atol=1e-6)
 
 
 # Noise

@@ -15,6 +15,7 @@ from envs_mjx import registry
 from envs_mjx.robot import BlockPulling, BlockPushing, DrawerOpening, scene
 from envs_mjx.robot.blocks import square_gap
 from envs_mjx.robot.planner import Planner, PlannerState, Trajectory, demonstrations
+from envs_mjx.robot.rotation import rotate_action
 from envs_mjx.robot.task import (
     LEFT,
     NOT_FINITE,
@@ -264,7 +265,7 @@ def test_images_come_back_from_a_trajectory(played) -> None:
 
 
 @pytest.mark.parametrize(("task", "begin", "end"), [
-    (BlockPulling, (0.42, 0.05), (0.6, 0.05)), (BlockPushing, (0.5, -0.03), (0.5, 0.15)),
+    (BlockPulling, (0.42, 0.05), (0.6, 0.05)), (BlockPushing, (0.5, -0.03), (0.5, 0.215)),
     (DrawerOpening, (0.5, 0.05), (0.3, 0.05))])
 def test_strokes(task: type[RobotTask], begin: tuple[float, float], end: tuple[float, float]) -> None:
     """The object is at (0.5, 0.05), the other one 10 cm along x from it, the pad 13.5 cm along y."""
@@ -303,6 +304,35 @@ def test_changing_over() -> None:
         assert chosen == [1] * patience + [0 if changes_over else 1] * 3
         ups = [bool(np.allclose(action, [0, 0, 1, 0])) for action in actions]
         assert ups == [False] * patience + [changes_over] * 2 + [False]
+
+
+def test_an_expert_stays_with_what_it_has_moved() -> None:
+    """It begins anew there, where one whose object never moved changes over."""
+    env = BlockPushing()
+    state = env.reset(jax.random.key(1))[0]
+    expert = Planner(env)
+    for moved in (False, True):
+        memory = dataclasses.replace(expert.start_with(jnp.int32(0), state), stage=jnp.int32(2))
+        if moved:
+            memory = dataclasses.replace(memory, seen=memory.seen - 0.01)
+        stages = []
+        for _ in range(env.plan.patience + 2):
+            stages.append(int(memory.stage))
+            _, memory = expert.act(memory, state)
+        assert stages[-1] == 0
+        assert int(memory.chosen) == (0 if moved else 1)
+
+
+@pytest.mark.parametrize("angle", [0.7, 2.0, 3.9])
+def test_an_expert_of_a_turned_scene_does_the_turned_action(angle: float) -> None:
+    env = BlockPulling()
+    expert = Planner(env)
+    for seed in range(4):
+        state = env.reset(jax.random.key(seed))[0]
+        actions = [expert.act(expert.start_with(shown.movable, shown), shown)[0]
+                   for shown in (state, env.turn(state, jnp.float32(angle)))]
+        assert np.linalg.norm(actions[0][:2]) == pytest.approx(1.0, abs=1e-5)
+        np.testing.assert_allclose(rotate_action(actions[0], jnp.float32(angle))[:3], actions[1][:3], atol=1e-5)
 
 
 def test_a_shaky_expert_sees_where_it_went(monkeypatch: pytest.MonkeyPatch) -> None:

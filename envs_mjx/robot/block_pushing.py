@@ -14,7 +14,9 @@ _ON_PAD = 0.05
 _CUBES, _PADS = 0.14, 0.135  # half-widths of the areas of their middles
 _APART, _FROM_PAD = 0.12, 0.09
 _DETOUR = 0.1
-_SHORT_OF_PAD = 0.035
+_BEYOND_PAD = 0.03
+"""Where a push ends that has not ended by success. The original's ends 3.5 cm short of the pad's middle, ever slower:
+who imitates that stops on the way when not sure where the pad is (imitation alone: 0.929, and 0.972 with this)."""
 _CANDIDATES = 64
 """A candidate is valid with probability 0.22 (measured): all of 64 fail once in 7e6 resets."""
 
@@ -30,7 +32,10 @@ class BlockPushing(BlockTask):
 
     name = "block_pushing"
     opening, has_pad = window.TASKS[name]
-    plan = Plan(hover=0.11, work=0.03, patience=2, retreat=(0.0, 0.0, 0.0, 0.0))
+    # The original's gives up after two steps and then stands still for two: who imitates that slows down where it is
+    # not sure that the cube has moved, and so it does not move. Imitation alone, one layer, 1 024 episodes: 0.852 (of
+    # 512) as the original, 0.957 with a patience of 3, up and not still, the nearer cube first; 0.972 with 4.
+    plan = Plan(hover=0.11, work=0.03, patience=4, retreat=(0.0, 0.0, 1.0, 0.0), nearer_first=True)
     block = Block(side=0.05, height=0.05, mass=0.02, friction=1.0)
     variables = (*BlockTask.variables,
                  *(Variable(name, hidden=False) for name in ("pad seen", "pad x", "pad y")))
@@ -57,10 +62,10 @@ class BlockPushing(BlockTask):
         return jnp.linalg.norm(env_state.qpos[4:6] - env_state.goal) < _ON_PAD
 
     def stroke(self, own: jax.Array, other: jax.Array, goal: jax.Array) -> Stroke:
-        """From behind the cube to a little before the pad's middle."""
+        """From behind the cube to a little beyond the pad's middle."""
         del other
         begin, forth = behind(own, goal)
-        return Stroke(begin, goal - _SHORT_OF_PAD * forth, forth)
+        return Stroke(begin, goal + _BEYOND_PAD * forth, forth)
 
     def ground_truth(self, env_state: RobotState) -> jax.Array:
         """(13,) float32: as of both tasks with blocks, and whether the pad is in view and where. Metres."""

@@ -18,6 +18,9 @@ class Plan:
     """Steps of work without motion before it changes over."""
     retreat: tuple[float, float, float, float]
     """The action of the two steps that change over."""
+    nearer_first: bool = False
+    """Whether it begins with the object that is nearer to the gripper, and not, as the paper's, with either. The hidden
+    variable makes nothing of it, and the mean of an actor that imitates both choices goes between the objects."""
 
 
 class Stroke(NamedTuple):

@@ -1,8 +1,12 @@
 """The scripted experts (paper Appendix C.1), and demonstrations from one compiled call.
 
-An expert chooses an object at random and works on it: it hovers above where the work starts, goes down, and pulls or
-pushes. When the object does not move for a while, it changes over to the other one. It reads poses, but not which
-object is movable. Lengths in metres, angles in radians.
+An expert chooses an object, at random or the nearer one, and works on it: it hovers above where the work starts, goes
+down, and pulls or pushes. When the object does not move for a while, it changes over to the other one, or begins anew
+if it has moved this one before. It reads poses, but not which object is movable. Lengths in metres, angles in radians.
+
+A step is cut to the largest length along its way, so that a stroke is straight and a turned one is the stroke of the
+turned scene. (The original cuts x and y each to the limits, and goes up to 45 degrees off the line. Imitation
+alone on Block-Pushing: 0.936 of 1 024 episodes so, and with copies' actions clipped; 0.972 without either.)
 """
 
 import jax
@@ -28,6 +32,7 @@ class PlannerState:
     chosen: jax.Array  # () int32, the object that it works on
     stage: jax.Array  # () int32: hover, down, work
     stuck: jax.Array  # () int32, steps of work without motion
+    loose: jax.Array  # () bool, whether it has moved that object
     retreating: jax.Array  # () int32, steps of retreat that are left
     seen: jax.Array  # (2, 2) where the objects were before the last action
 
@@ -66,33 +71,42 @@ class Planner:
         self.noise = noise
 
     def start(self, key: jax.Array, env_state: RobotState) -> PlannerState:
-        """Choose an object at random."""
-        return self.start_with(jax.random.bernoulli(key).astype(jnp.int32), env_state)
+        """Choose an object at random, or the nearer one."""
+        chosen = jax.random.bernoulli(key)
+        if self.env.plan.nearer_first:
+            chosen = jnp.argmin(jnp.linalg.norm(self.env.object_offsets(env_state), axis=1))
+        return self.start_with(chosen.astype(jnp.int32), env_state)
 
     def start_with(self, chosen: jax.Array, env_state: RobotState) -> PlannerState:
         """Choose the object `chosen`, () int32."""
         zero = jnp.zeros((), jnp.int32)
-        return PlannerState(chosen, zero, zero, zero, self.env.object_poses(env_state)[:, :2])
+        return PlannerState(chosen, zero, zero, jnp.zeros((), bool), zero, self.env.object_poses(env_state)[:, :2])
 
     def act(self, planner: PlannerState, env_state: RobotState) -> tuple[jax.Array, PlannerState]:
         """The action (4,) in [-1, 1], and what to remember."""
         objects = self.env.object_poses(env_state)
         moved = jnp.linalg.norm(objects[planner.chosen, :2] - planner.seen[planner.chosen]) > _MOVED
-        stuck = jnp.where((planner.stage == _WORK) & ~moved, planner.stuck, 0)
-        change = (stuck >= self.env.plan.patience) & self.changes_over
+        working = planner.stage == _WORK
+        loose = planner.loose | (working & moved)
+        stuck = jnp.where(working & ~moved, planner.stuck, 0)
+        anew = (stuck >= self.env.plan.patience) & self.changes_over
+        change = anew & ~loose
         chosen = jnp.where(change, 1 - planner.chosen, planner.chosen)
-        stage = jnp.where(change, 0, planner.stage)
-        retreating = jnp.where(change, _RETREAT_STEPS, planner.retreating)
+        stage = jnp.where(anew, 0, planner.stage)
+        retreating = jnp.where(anew, _RETREAT_STEPS, planner.retreating)
 
         error = self._waypoints(objects, chosen, env_state.goal)[stage] - env_state.qpos[:4]
         error = error.at[3].set(_wrap_half_turn(error[3]))
         steps = error / scene.ACTION_SCALE
-        arrives = (jnp.abs(steps) < 1).all() & (retreating == 0)
-        action = jnp.where(retreating > 0, jnp.array(self.env.plan.retreat, jnp.float32), jnp.clip(steps, -1.0, 1.0))
+        distance = jnp.linalg.norm(steps[:2])
+        arrives = (distance < 1) & (jnp.abs(steps[2:]) < 1).all() & (retreating == 0)
+        straight = jnp.clip(steps.at[:2].divide(jnp.maximum(distance, 1.0)), -1.0, 1.0)
+        action = jnp.where(retreating > 0, jnp.array(self.env.plan.retreat, jnp.float32), straight)
         return action, PlannerState(
             chosen=chosen,
             stage=jnp.where(arrives, (stage + 1) % _STAGES, stage),
-            stuck=jnp.where(change, 0, jnp.where(stage == _WORK, stuck + 1, 0)),
+            stuck=jnp.where(anew, 0, jnp.where(stage == _WORK, stuck + 1, 0)),
+            loose=loose,
             retreating=jnp.maximum(retreating - 1, 0),
             seen=objects[:, :2],
         )

@@ -17,8 +17,11 @@ def random_angle(key: jax.Array) -> jax.Array:
 
 
 def rotate_action(action: jax.Array, angle: jax.Array) -> jax.Array:
-    """Turn (dx, dy) of an action (4,) by `angle` () and clip them to [-1, 1]; dz and the gripper's turn stay."""
-    return jnp.concatenate([jnp.clip(turn_vectors(action[:2], angle), -1.0, 1.0), action[2:]])
+    """Turn (dx, dy) of an action (4,) by `angle` (); dz and the gripper's turn stay.
+
+    Not clipped to [-1, 1], as the original does: (1, 1) turned is up to 1.41 long, as is the way in the turned scene.
+    """
+    return jnp.concatenate([turn_vectors(action[:2], angle), action[2:]])
 
 
 def mirror_action(action: jax.Array) -> jax.Array:

@@ -239,7 +239,9 @@ class SAC(Agent):
         demonstrations: it does not fit itself to episodes that the actor drew from it."""
         mean, log_scale = (
             x.reshape(*tokens.segment.shape, -1)[:, :-1] for x in self._call("policy", agent, online.actor))
-        valid, action, intended = transitions(tokens), jnp.tanh(mean), cast(jax.Array, tokens.intended)[:, 1:]
+        # In a turned copy of an episode actions may leave the actor's range.
+        intended = jnp.clip(cast(jax.Array, tokens.intended)[:, 1:], -1.0, 1.0)
+        valid, action = transitions(tokens), jnp.tanh(mean)
         near = demonstrated = valid & cast(jax.Array, tokens.demonstrated)[:, :-1]
         if tokens.succeeded is not None:
             near |= valid & tokens.succeeded[:, :-1]

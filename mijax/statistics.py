@@ -7,6 +7,8 @@ import numpy as np
 
 Array = np.ndarray
 
+ROUND_OFF = 1e-6
+"""Of numbers that were float32: 19 successes of 20 are recorded as 0.94999999."""
 _BLOCK_ELEMENTS = 4_000_000
 """Numbers resampled at once, to bound the memory of long curves (32 MB)."""
 
@@ -105,8 +107,8 @@ def probability_of_improvement(ours: Array, theirs: Array, *, resamples: int = 2
 
 
 def steps_to_threshold(steps: Sequence[int], values: Sequence[float], threshold: float) -> int | None:
-    """The first of `steps` whose value reaches `threshold`; None when none does."""
-    return next((int(step) for step, value in zip(steps, values, strict=True) if value >= threshold), None)
+    """The first of `steps` whose value reaches `threshold`, up to float32's round-off; None when none does."""
+    return next((int(step) for step, value in zip(steps, values, strict=True) if value >= threshold - ROUND_OFF), None)
 
 
 def running_mean(values: Array, window: int) -> Array:

@@ -78,6 +78,7 @@ def test_probability_of_improvement_is_mann_whitneys_u(ours, theirs):
 def test_steps_to_threshold():
     assert statistics.steps_to_threshold([10, 20, 30], [0.1, 0.95, 0.2], 0.95) == 20
     assert statistics.steps_to_threshold([10, 20, 30], [0.1, 0.9, 0.2], 0.95) is None
+    assert statistics.steps_to_threshold([10, 20], [0.9, float(np.float32(19) / np.float32(20))], 0.95) == 20
     with pytest.raises(ValueError, match="shorter"):
         statistics.steps_to_threshold([10, 20], [0.1], 0.95)
 

@@ -2,8 +2,8 @@
 
     python -m mijax.train --domain drawer_opening
 
-Success 1.000 of 500 episodes, one seed (results/robots). A quarter of an hour of one core, and five
-minutes for stage 1.
+Success 1.000 of 500 episodes in each of three seeds, before experts went straight (results/robots). Seven to thirteen
+minutes of one core, and four for stage 1.
 """
 
 from configs.robots import robot

@@ -154,9 +154,10 @@ class NetworkConfig:
 class DQNConfig:
     """Double DQN on whole episodes, for discrete actions (paper Appendix A.6, Table 2).
 
-    The defaults are what measurement found on Heaven-Hell; the paper's values stand beside them. What mattered, in
-    order: returns with traces, few updates per step (the paper's ratio shows each step to the learner 816 times, and a
-    memory network learns such a small replay by heart), a discount that leaves a gap between actions.
+    The defaults are what measurement found on Heaven-Hell; the paper's values stand beside them. What was changed
+    (results/what_matters.md): returns with traces, few updates per step (the paper's ratio shows each step to the
+    learner 816 times, and a memory network learns such a small replay by heart), a discount that leaves a gap between
+    actions.
     """
 
     learning_rate: float = 1e-3

@@ -54,7 +54,8 @@ class RunFolder:
         """
         run = cls(pathlib.Path(path))
         if run._file("config.json").exists():
-            raise RunError(f"{path}: already holds a run; continue it with --resume {path}, or choose another --out")
+            raise RunError(f"{path}: already holds a run; `python -m mijax.train --resume {path}` goes on with it; "
+                           "choose another --out")
         with _named_errors(run.path):
             run.path.mkdir(parents=True, exist_ok=True)
             started = {"versions.json", f"versions.json{ASIDE}", f"config.json{ASIDE}"}  # a killed start leaves these

@@ -1,5 +1,7 @@
 """Stage 1 from an expert's episodes: transitions of moments, and copies that a symmetry moves."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -134,6 +136,32 @@ def test_a_copy_is_the_transition_in_a_turned_world(data: Transitions) -> None:
     again = jax.jit(problem.batch)(chosen, jax.random.key(2)).shown
     assert again is not None
     assert (again.observation[10:] != shown.observation[10:]).any()
+
+
+def test_variables_are_in_units_of_what_copies_show() -> None:
+    """Where x hardly differs before the world is turned."""
+    class Upright(Plane):
+        def reset(self, key):
+            env_state, _ = super().reset(key)
+            env_state = dataclasses.replace(env_state, place=env_state.place * jnp.array([0.01, 1.0]))
+            return env_state, self.show(env_state)
+
+        def demonstrations(self, key, number):
+            def play(key):
+                first = self.reset(key)[0]
+                moments = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.horizon + 1, *x.shape)), first)
+                return dataclasses.replace(moments, time=jnp.arange(self.horizon + 1))
+
+            return Demonstrations(jax.vmap(play)(jax.random.split(key, number)), jnp.zeros((number, self.horizon, 2)),
+                                  jnp.full(number, STEPS, jnp.int32), jnp.ones(number, bool))
+
+    env = Upright()
+    still = collect(env, jax.random.key(0), 200, "demonstrations")
+    for copies, unit in ((0, 0.01), (2, 0.7)):
+        problem = Problem.of(env, Stage1Config(
+            data="demonstrations", episodes=200, copies=copies, batch_size=20), still)
+        one = problem.seen(jnp.array([[0.0, unit]])) - problem.seen(jnp.zeros((1, 2)))
+        assert float(one[0, 0]) == pytest.approx(1.0, rel=0.25)
 
 
 @pytest.mark.lenient

@@ -149,7 +149,7 @@ def _units(env: Environment, config: Stage1Config, data: Transitions) -> tuple[n
     """(V',) center and scale of the variables that are not hidden.
 
     Where there are augmented copies, of those: they are most of what is learnt from, and a variable may hardly differ
-    without them (the yaw in demonstrations of Block-Pulling: 37 standard deviations of theirs in a turned copy).
+    without them (the yaw in demonstrations of Block-Pulling: up to 48 of its standard deviations in a turned copy).
     """
     truth = data.ground_truth
     if config.copies > 0:

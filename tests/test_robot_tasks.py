@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import configs
+import envs_mjx.robot
 from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.robot import BlockPulling, BlockPushing, DrawerOpening, scene
@@ -371,6 +372,16 @@ def test_arguments_of_a_task() -> None:
     assert registry.make("block_pushing,stop_force=12.5,noise=0.007").stop_force == 12.5  # pyright: ignore
     with pytest.raises(registry.UnknownDomain, match="expected numbers >= 0"):
         registry.make("block_pushing,expert_noise=-1")
+
+
+def test_a_task_whose_import_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_graphics(name: str) -> None:
+        raise AttributeError(f"{name}: no attribute 'glGetError'")  # as MuJoCo does where MUJOCO_GL cannot be had
+
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr("envs_mjx.robot.importlib.import_module", no_graphics)
+    with pytest.raises(ImportError, match=r"block_pushing: no attribute 'glGetError' \(MUJOCO_GL is 'osmesa'\)"):
+        envs_mjx.robot.__getattr__("BlockPushing")
 
 
 @pytest.mark.slow

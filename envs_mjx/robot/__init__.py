@@ -4,6 +4,7 @@ The tasks are imported when they are first asked for: a robot's computer without
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -19,4 +20,7 @@ _MODULES = {"BlockPulling": "block_pulling", "BlockPushing": "block_pushing", "D
 def __getattr__(name: str) -> type:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    try:
+        return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    except AttributeError as error:  # MuJoCo raises one where it cannot draw: the task would seem not to exist
+        raise ImportError(f"{error} (MUJOCO_GL is {os.environ.get('MUJOCO_GL')!r})") from error

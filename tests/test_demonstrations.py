@@ -138,6 +138,18 @@ def test_a_copy_is_the_transition_in_a_turned_world(data: Transitions) -> None:
     assert (again.observation[10:] != shown.observation[10:]).any()
 
 
+def test_each_held_out_episode_is_moved_as_a_whole(data: Transitions) -> None:
+    moved = collect(Plane(), jax.random.key(0), 40, "demonstrations", moved=True)
+    here, there = (np.asarray(d.observations)[d.observation] for d in (data, moved))
+    after = np.asarray(moved.observations)[moved.next_observation]
+    np.testing.assert_allclose(after - there, moved.action, atol=1e-5)
+    np.testing.assert_allclose(moved.ground_truth[:, 1], there[:, 0], atol=1e-6)
+    turned = np.angle((there @ [1, 1j]) / (here @ [1, 1j])).reshape(40, STEPS)
+    np.testing.assert_allclose(np.exp(1j * turned), np.exp(1j * turned[:, :1]).repeat(STEPS, axis=1), atol=1e-3)
+    assert len(np.unique(turned[:, 0].round(3))) > 30
+    np.testing.assert_array_equal(moved.reward, data.reward)
+
+
 def test_variables_are_in_units_of_what_copies_show() -> None:
     """Where x hardly differs before the world is turned."""
     class Upright(Plane):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.base import Environment, EnvState, TimeStep
+from envs_mjx.base import Demonstrations, Environment, EnvState, TimeStep
 from mijax.config import DataSource
 from mijax.demonstrations import demonstrate
 
@@ -141,30 +141,38 @@ def tabulate(transitions: Transitions) -> tuple[TransitionTable, jax.Array]:
     return jax.tree.map(lambda c: c[first], columns), jnp.asarray(inverse.reshape(-1), jnp.int32)
 
 
-def collect(env: Environment, key: jax.Array, num_episodes: int, source: DataSource = "random") -> Transitions:
+def collect(
+    env: Environment, key: jax.Array, num_episodes: int, source: DataSource = "random", moved: bool = False
+) -> Transitions:
     """The transitions of `num_episodes` episodes of the random policy or of the environment's expert (Appendix C.1).
+
+    Demonstrations are `moved`, if asked for, each by a symmetry of its own, as copies of them are in training.
 
     Raises:
         ConfigError: demonstrations are asked of an environment without an expert.
     """
     if source == "demonstrations":
-        return demonstrated(env, key, num_episodes)
+        return demonstrated(env, key, num_episodes, moved)
     return flatten(random_episodes(env, key, num_episodes))
 
 
-def demonstrated(env: Environment, key: jax.Array, num_episodes: int) -> Transitions:
+def demonstrated(env: Environment, key: jax.Array, num_episodes: int, moved: bool = False) -> Transitions:
     """The transitions of an expert's episodes. Every moment counts as distinct, and is kept beside its frames."""
-    episodes = jax.device_get(demonstrate(env, key, num_episodes))
+    episodes: Demonstrations = jax.device_get(demonstrate(env, key, num_episodes))
     horizon = episodes.action.shape[1]
     row, step = np.nonzero(np.arange(horizon) < episodes.length[:, None])
     seen = np.arange(horizon + 1) <= episodes.length[:, None]
     index = np.cumsum(seen).reshape(seen.shape).astype(np.int32) - 1
     now, after = index[row, step], index[row, step + 1]
     moments = jax.tree.map(lambda leaf: jnp.asarray(leaf[seen]), episodes.env_state)
+    actions = np.concatenate([episodes.action, np.zeros_like(episodes.action[:, :1])], axis=1)[seen]
+    if moved:
+        symmetries = jax.random.split(jax.random.fold_in(key, 1), num_episodes)[np.nonzero(seen)[0]]
+        moments, actions = jax.jit(jax.vmap(env.augment))(symmetries, moments, jnp.asarray(actions))
     shown, truth, reveals = _look(env, moments)
     return Transitions(
         states=shown.state, observations=shown.observation, state=jnp.asarray(now), observation=jnp.asarray(now),
-        action=jnp.asarray(episodes.action[row, step]), reward=shown.reward[after], next_state=jnp.asarray(after),
+        action=jnp.asarray(actions[now]), reward=shown.reward[after], next_state=jnp.asarray(after),
         next_observation=jnp.asarray(after), terminal=shown.terminated[after], ground_truth=truth[now],
         reveals=reveals[now], episode=jnp.asarray(row, jnp.int32), moments=moments)
 

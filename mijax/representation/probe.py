@@ -130,6 +130,8 @@ def probe(
 ) -> ProbeReport:
     """Test a representation on `config.heldout_episodes` episodes like those of training, drawn with `key`.
 
+    Where training moves copies by a symmetry, each of these episodes is moved by one.
+
     Args:
         representation: the encoders.
         env: where they were trained.
@@ -138,7 +140,8 @@ def probe(
         history: what training left, for the errors of the dynamics model; None leaves them out.
     """
     data_key, mlp_key = jax.random.split(key)
-    return probe_on(collect(env, data_key, config.heldout_episodes, config.data), representation, env, mlp_key, history)
+    data = collect(env, data_key, config.heldout_episodes, config.data, moved=config.copies > 0)
+    return probe_on(data, representation, env, mlp_key, history)
 
 
 def probe_on(

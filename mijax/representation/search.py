@@ -144,7 +144,7 @@ def search(
     data = collect(env, data_key, config.episodes, config.data)
     problem = Problem.of(env, dataclasses.replace(config, **largest), data)
     heldout_key, probe_key = jax.random.split(jax.random.fold_in(first_key, 1))
-    heldout = collect(env, heldout_key, config.heldout_episodes, config.data)
+    heldout = collect(env, heldout_key, config.heldout_episodes, config.data, moved=config.copies > 0)
     init_keys = jnp.stack([jax.random.split(key, 3)[1] for key in keys.values()])
     group = _Group(
         list(range(len(configs))), _stack([LossWeights.of(c) for c in configs for _ in keys]),

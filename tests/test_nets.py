@@ -14,6 +14,7 @@ from envs_mjx.base import ArraySpec
 from mijax.agents.dqn import DQN, make_dqn
 from mijax.config import Config, MemoryName, NetworkConfig, Stage1Config
 from mijax.frames import FrameTable
+from mijax.nets.dropout import Dropout
 from mijax.nets.gpt import sine_positions
 from mijax.packing import Layout, first_fit, gather_rows, one_per_row
 from mijax.replay import Replay, StepRecord
@@ -229,6 +230,20 @@ def test_dropout_is_off_unless_asked_for():
     dropped = jax.jit(lambda key: apply(params, tokens, False, rngs={"dropout": key}).q)
     assert not np.allclose(dropped(jax.random.key(0)), dropped(jax.random.key(1)))
     network.apply(params, tokens)  # needs no key
+
+
+@pytest.mark.parametrize("rate", [0.1, 0.5])
+def test_dropout_zeroes_its_share_and_keeps_the_mean(rate: float):
+    """And neighbours do not depend on one another."""
+    x = jnp.ones((401, 127))
+    y = np.asarray(Dropout(rate).apply({}, x, False, rngs={"dropout": jax.random.key(0)}))
+    kept, share = y > 0, 1 - round(rate * 256) / 256
+    noise = np.sqrt(share * (1 - share) / y.size)
+    assert kept.mean() == pytest.approx(share, abs=4 * noise)
+    np.testing.assert_allclose(y[kept], 1 / share, rtol=1e-6)
+    flat = kept.reshape(-1)
+    for apart in (1, 2, 3, 4, 127):
+        assert np.mean(flat[:-apart] & flat[apart:]) == pytest.approx(share**2, abs=5 * noise)
 
 
 def test_sine_positions():

@@ -1,6 +1,7 @@
 """Many trainings from one small file, side by side, resumable.
 
     python -m launch.sweep SPEC [--out FOLDER] [--backend local|ray] [--workers N] [--address RAY]
+    python -m launch.sweep SPEC [--out FOLDER] --list | --job NUMBER
 
 SPEC is YAML. Every combination of `grid` is a job, a run of `mijax.train`:
 
@@ -19,6 +20,13 @@ every job's last checkpoint; finished jobs are left alone. `python -m mijax.repo
 
 `local` gives every job its own cores of this machine. `ray` places jobs by what they ask for on the nodes of a Ray
 cluster, which must share OUT; a job whose worker or node died is placed anew.
+
+`--job` runs one of the jobs that `--list` numbers and no other, for clusters that have a queue of their own. On SLURM,
+where OUT is shared, a sweep of twelve is this script; submitted again, it goes on with what is not done:
+
+    #!/bin/bash
+    #SBATCH --array=0-11 --cpus-per-task=1 --time=04:00:00 --signal=B:TERM@120
+    exec python -m launch.sweep SPEC --job "$SLURM_ARRAY_TASK_ID"
 """
 
 import argparse
@@ -374,9 +382,11 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--backend", choices=("local", "ray"), default="local")
     parser.add_argument("--workers", type=int, help="jobs side by side (local); default: as many as their cores fit")
     parser.add_argument("--address", help="of the Ray cluster; default: one on this machine")
+    parser.add_argument("--list", action="store_true", help="number, name and state of every job; nothing is run")
+    parser.add_argument("--job", type=int, metavar="NUMBER", help="run this job alone (local)")
     options = parser.parse_args(arguments)
     require(options.workers is None or options.workers >= 1, "workers", options.workers, "a number >= 1")
-    for name, other in (("workers", "local"), ("address", "ray")):
+    for name, other in (("workers", "local"), ("job", "local"), ("address", "ray")):
         given = getattr(options, name)
         require(given is None or options.backend == other, name, given, f"nothing, it belongs to --backend {other}")
     return options
@@ -390,6 +400,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse(sys.argv[1:] if arguments is None else arguments)
         out = (options.out or pathlib.Path("runs") / options.spec.stem).resolve()
         sweep = read(options.spec, out)
+        if options.list:
+            for number, job in enumerate(sweep.jobs):
+                console.print(f"{number} {job.name}{': done' if job.done else ''}", highlight=False, soft_wrap=True)
+            return 0
+        if options.job is not None:
+            last = len(sweep.jobs) - 1
+            require(0 <= options.job <= last, "job", options.job, f"0 to {last}, which --list shows")
+            sweep = dataclasses.replace(sweep, jobs=(sweep.jobs[options.job],))
         backend = Local(sweep, options.workers) if options.backend == "local" else OnRay(sweep, options.address)
     except (UserError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

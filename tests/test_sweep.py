@@ -75,7 +75,8 @@ def test_a_bad_file_is_refused_before_anything_runs(tmp_path: pathlib.Path, text
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (["--workers", "0"], "workers: got 0"), (["--address", "auto"], "address: got 'auto', accepted: nothing")])
+    (["--workers", "0"], "workers: got 0"), (["--address", "auto"], "address: got 'auto', accepted: nothing"),
+    (["--job", "1", "--backend", "ray"], "job: got 1, accepted: nothing, it belongs to --backend local")])
 def test_bad_options(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]):
     assert message in failure_of(sweep.main, capsys, "spec.yaml", *arguments)
 
@@ -134,6 +135,21 @@ def test_stopping_asks_the_running_jobs_to_save_and_starts_no_other(tmp_path: pa
         time.sleep(0.05)
     backend.stop()
     assert backend.states == {"one": "stopped", "two": "stopped", "three": "waiting"}
+
+
+def test_one_job_of_a_sweep_for_the_queue_of_a_cluster(
+        tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    jobs = tuple(Scripted(name, ("end()",), tmp_path) for name in ("one", "two"))
+    monkeypatch.setattr(sweep, "read", lambda spec, out: Sweep(jobs, 1, 0.0, 2))
+    assert sweep.main(["spec.yaml", "--job", "1"]) == 0
+    assert [job.done for job in jobs] == [False, True]
+    capsys.readouterr()
+    assert sweep.main(["spec.yaml", "--list"]) == 0
+    assert capsys.readouterr().out == "0 one\n1 two: done\n"
+    refused = failure_of(sweep.main, capsys, "spec.yaml", "--job", "2")
+    assert "job: got 2, accepted: 0 to 1, which --list shows" in refused
+    assert sweep.main(["spec.yaml", "--job", "1"]) == 0
+    assert jobs[1].starts == 1
 
 
 def test_a_job_goes_on_with_its_own_run(tmp_path: pathlib.Path):

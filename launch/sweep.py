@@ -21,11 +21,12 @@ every job's last checkpoint; finished jobs are left alone. `python -m mijax.repo
 `local` gives every job its own cores of this machine. `ray` places jobs by what they ask for on the nodes of a Ray
 cluster, which must share OUT; a job whose worker or node died is placed anew.
 
-`--job` runs one of the jobs that `--list` numbers and no other, for clusters that have a queue of their own. On SLURM,
-where OUT is shared, a sweep of twelve is this script; submitted again, it goes on with what is not done:
+`--job` runs one of the jobs that `--list` numbers and no other, on whatever cores it is given, for clusters that have a
+queue of their own. On SLURM, where OUT is shared, a sweep of twelve is this script. Submitted again once it has ended,
+with the same SPEC, it goes on with what is not done:
 
     #!/bin/bash
-    #SBATCH --array=0-11 --cpus-per-task=1 --time=04:00:00 --signal=B:TERM@120
+    #SBATCH --array=0-11 --cpus-per-task=2 --time=04:00:00 --signal=B:TERM@120
     exec python -m launch.sweep SPEC --job "$SLURM_ARRAY_TASK_ID"
 """
 
@@ -254,9 +255,9 @@ class Backend(Protocol):
 
 
 class Local:
-    """Jobs on the cores of this machine, each on cores of its own."""
+    """Jobs on the cores of this machine, each on cores of its own, or on any where a queue has dealt them out."""
 
-    def __init__(self, sweep: Sweep, workers: int | None = None) -> None:
+    def __init__(self, sweep: Sweep, workers: int | None = None, dealt_out: bool = False) -> None:
         cores = available_cores()
         fitting = max(1, len(cores) // sweep.cpus)
         self.states: dict[str, State] = {job.name: "done" if job.done else "waiting" for job in sweep.jobs}
@@ -264,6 +265,8 @@ class Local:
         self._retries = sweep.retries
         self._processes: list[subprocess.Popen] = []
         shares = [cores[i % fitting * sweep.cpus:][: sweep.cpus] for i in range(workers or fitting)]
+        if dealt_out:
+            shares = [[] for _ in shares]
         self._threads = [threading.Thread(target=self._work, args=(share,), daemon=True) for share in shares]
         for thread in self._threads:
             thread.start()
@@ -382,8 +385,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--backend", choices=("local", "ray"), default="local")
     parser.add_argument("--workers", type=int, help="jobs side by side (local); default: as many as their cores fit")
     parser.add_argument("--address", help="of the Ray cluster; default: one on this machine")
-    parser.add_argument("--list", action="store_true", help="number, name and state of every job; nothing is run")
-    parser.add_argument("--job", type=int, metavar="NUMBER", help="run this job alone (local)")
+    alone = parser.add_mutually_exclusive_group()
+    alone.add_argument("--list", action="store_true", help="number and name of every job, and which are done; run none")
+    alone.add_argument("--job", type=int, metavar="NUMBER", help="run this job alone, on any cores (local)")
     options = parser.parse_args(arguments)
     require(options.workers is None or options.workers >= 1, "workers", options.workers, "a number >= 1")
     for name, other in (("workers", "local"), ("job", "local"), ("address", "ray")):
@@ -408,7 +412,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             last = len(sweep.jobs) - 1
             require(0 <= options.job <= last, "job", options.job, f"0 to {last}, which --list shows")
             sweep = dataclasses.replace(sweep, jobs=(sweep.jobs[options.job],))
-        backend = Local(sweep, options.workers) if options.backend == "local" else OnRay(sweep, options.address)
+        local = options.backend == "local"
+        backend = (Local(sweep, options.workers, dealt_out=options.job is not None) if local
+                   else OnRay(sweep, options.address))
     except (UserError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -28,6 +28,7 @@ from mijax.learner import Learner, LearnerState, make_learner
 from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
 from mijax.trained import load_learner_state, seeds_of, training_of
+from mijax.versions import current_versions
 
 if TYPE_CHECKING:
     from envs_mjx.robot.real_trial import Half, Policy, RealEpisode
@@ -163,7 +164,7 @@ def _play(
     print(f"{title}: {options.episodes} episodes")
     print(table(rows))
     out.mkdir(parents=True, exist_ok=True)
-    (out / "transfer.json").write_text(json.dumps(_results(rows, episodes), indent=1) + "\n")
+    (out / "transfer.json").write_text(json.dumps(_results(title, rows, episodes), indent=1) + "\n")
     print(f"every episode: {out / 'transfer.json'}")
     if options.gif:
         _films(world, episodes, out, print)
@@ -179,13 +180,14 @@ def table(rows: "Sequence[Half]") -> str:
     return "\n".join(lines)
 
 
-def _results(rows: "Sequence[Half]", episodes: "Sequence[RealEpisode]") -> dict[str, Any]:
+def _results(title: str, rows: "Sequence[Half]", episodes: "Sequence[RealEpisode]") -> dict[str, Any]:
     from envs_mjx.robot.task import OUTCOMES
 
     played = [{"outcome": OUTCOMES[episode.outcome], "length": episode.length,
                "touched_first": {-1: None, 0: "immovable", 1: "movable"}[episode.first_touched],
                "pressed_newtons": round(episode.states[-1].pressed, 1)} for episode in episodes]
-    return {"table": [dataclasses.asdict(row) for row in rows], "episodes": played}
+    return {"played": title, "versions": current_versions(), "table": [dataclasses.asdict(row) for row in rows],
+            "episodes": played}
 
 
 def _films(

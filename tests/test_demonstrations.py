@@ -1,6 +1,7 @@
 """Stage 1 from an expert's episodes: transitions of moments, and copies that a symmetry moves."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -177,10 +178,19 @@ def test_variables_are_in_units_of_what_copies_show() -> None:
 
 
 @pytest.mark.lenient
-def test_stage_1_learns_from_copies() -> None:
+def test_stage_1_learns_from_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = []
+
+    def spy(*arguments: Any, **options: Any) -> Transitions:
+        moved.append(options["moved"])
+        return collect(*arguments, **options)
+
+    monkeypatch.setattr("mijax.representation.probe.collect", spy)
     config = Stage1Config(data="demonstrations", episodes=40, heldout_episodes=40, copies=1, batch_size=40, epochs=3,
                           features=4)
     representation, history = learn_representation(Plane(), config, jax.random.key(0))
     assert history.updates == 3 * (2 * 40 * STEPS // 40)
     report = probe(representation, Plane(), config, jax.random.key(1), history)
     assert {d.variable for d in report.decodings} == {"side", "x"}
+    probe(representation, Plane(), dataclasses.replace(config, copies=0), jax.random.key(1))
+    assert moved == [True, False]

@@ -124,7 +124,7 @@ def test_pressing_onto_an_object_is_a_protective_stop(world: RealWorld) -> None:
     if world.training.name == "drawer_opening":
         above = env_state.robot.poses[0]  # the cabinet itself
     opening = world.training.opening.finger
-    place = np.asarray(above)[:2] + np.array([-opening, 0.0])  # one finger on its middle, the other one beside it
+    place = np.asarray(above)[:2] + np.array([-opening, 0.0])  # one finger on its middle
     robot = dataclasses.replace(env_state.robot, qpos=np.concatenate([[*place, 0.1, 0.0], env_state.robot.qpos[4:]]))
     env_state = world.set_up(robot, jax.random.key(0))
     for number in range(4):
@@ -221,6 +221,8 @@ def test_the_expert_from_the_command_line(
     assert (tmp_path / "success.gif").exists()
     stored = json.loads((tmp_path / "transfer.json").read_text())
     assert [episode["touched_first"] for episode in stored["episodes"]] == ["immovable", "movable"] * 10
+    assert stored["played"] == f"{domain}, the scripted expert, gap none"
+    assert stored["versions"]["jax"]
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import configs
 import envs_mjx.robot
 from configs.paper import paper
 from envs_mjx import registry
-from envs_mjx.robot import BlockPulling, BlockPushing, DrawerOpening, scene
+from envs_mjx.robot import BlockPulling, BlockPushing, DrawerOpening, drawer_opening, scene, window
 from envs_mjx.robot.blocks import square_gap
 from envs_mjx.robot.planner import Planner, PlannerState, Trajectory, demonstrations
 from envs_mjx.robot.rotation import rotate_action
@@ -368,6 +368,11 @@ def test_a_shaky_expert_sees_where_it_went(monkeypatch: pytest.MonkeyPatch) -> N
     assert np.abs(shown.actions).max() <= 1
 
 
+def test_the_closed_gripper_fits_between_a_handle_s_side_bars() -> None:
+    width = 2 * (window.CLOSED.finger + window.FINGER_RADIUS)
+    assert width + 0.015 < drawer_opening.SIDE_APART - 2 * drawer_opening.SIDE_RADIUS
+
+
 def test_arguments_of_a_task() -> None:
     assert registry.make("block_pushing,stop_force=12.5,noise=0.007").stop_force == 12.5  # pyright: ignore
     with pytest.raises(registry.UnknownDomain, match="expected numbers >= 0"):
@@ -375,13 +380,16 @@ def test_arguments_of_a_task() -> None:
 
 
 def test_a_task_whose_import_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_graphics(name: str) -> None:
-        raise AttributeError(f"{name}: no attribute 'glGetError'")  # as MuJoCo does where MUJOCO_GL cannot be had
+    class NoGraphics:
+        @staticmethod
+        def import_module(name: str) -> None:
+            raise AttributeError(f"{name}: no attribute 'glGetError'")  # as MuJoCo does where MUJOCO_GL cannot be had
 
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr("envs_mjx.robot.importlib.import_module", no_graphics)
-    with pytest.raises(ImportError, match=r"block_pushing: no attribute 'glGetError' \(MUJOCO_GL is 'osmesa'\)"):
-        envs_mjx.robot.__getattr__("BlockPushing")
+    monkeypatch.setattr(envs_mjx.robot, "importlib", NoGraphics)
+    cause = r"ImportError: .*block_pushing: no attribute 'glGetError' \(MUJOCO_GL is 'osmesa'\)"
+    with pytest.raises(registry.UnknownDomain, match=cause):
+        registry.make("block_pushing")
 
 
 @pytest.mark.slow

@@ -139,7 +139,12 @@ def test_stopping_asks_the_running_jobs_to_save_and_starts_no_other(tmp_path: pa
 
 def test_one_job_of_a_sweep_for_the_queue_of_a_cluster(
         tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    jobs = tuple(Scripted(name, ("end()",), tmp_path) for name in ("one", "two"))
+    class Dealt(Scripted):
+        def command(self, cores: object) -> list[str]:
+            assert not cores  # two jobs of an array on one machine must not take the same one
+            return super().command(cores)
+
+    jobs = tuple(Dealt(name, ("end()",), tmp_path) for name in ("one", "two"))
     monkeypatch.setattr(sweep, "read", lambda spec, out: Sweep(jobs, 1, 0.0, 2))
     assert sweep.main(["spec.yaml", "--job", "1"]) == 0
     assert [job.done for job in jobs] == [False, True]

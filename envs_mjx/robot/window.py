@@ -48,7 +48,7 @@ OPEN = Opening(0.052, 29.0)
 HALF_OPEN = Opening(0.036, 14.0)
 CLOSED = Opening(0.0075, 0.0)
 """40 mm over both fingers, of the 60 that a handle's side bars leave; the original's bar of 80 mm would sit on them. At
-0.015 an agent came down on them in half of its episodes in the other world (results/robots)."""
+0.015 an agent ended half of its episodes in the other world by a protective stop (one seed, results/robots)."""
 
 
 class Outfit(NamedTuple):

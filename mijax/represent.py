@@ -63,11 +63,12 @@ def represent(options: RepresentOptions) -> None:
     seeds, env = parse_seeds(options.seeds), registry.make(options.domain)
     check_contract(env)
     run = open_run(options, seeds)
-    if options.search:
-        passed = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print).best.passed
-    else:
-        stage1.representations(run, env, options.stage1, seeds, print)
-        passed = sum(stage1.passed(run, seed) for seed in seeds)
+    with run.held():
+        if options.search:
+            passed = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print).best.passed
+        else:
+            stage1.representations(run, env, options.stage1, seeds, print)
+            passed = sum(stage1.passed(run, seed) for seed in seeds)
     if env.variables:
         print(f"{passed} of {len(seeds)} representations pass P1 and P2")
 

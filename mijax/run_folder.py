@@ -14,6 +14,8 @@ since the previous line, so that lines dropped on resuming take their seconds wi
 
 import contextlib
 import dataclasses
+import errno
+import fcntl
 import json
 import math
 import os
@@ -89,6 +91,27 @@ class RunFolder:
             self._file(name).unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # it holds something else, or is where the program works
             self.path.rmdir()
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other processes from working in the folder meanwhile; `RunError` where one does.
+
+        The lock is on the folder itself and ends with the process, however that ends. A file system without locks
+        is worked on without.
+        """
+        with _named_errors(self.path):
+            folder = os.open(self.path, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise RunError(f"{self.path}: another process is at work in it; wait for its end, or stop it") from None
+            except OSError as error:
+                if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+                    raise
+            yield
+        finally:
+            os.close(folder)
 
     def config(self) -> dict[str, Any]:
         """The run's options, as written by `create`."""

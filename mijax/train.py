@@ -119,9 +119,7 @@ def open_run(options: TrainOptions, fill: Callable[[RunFolder], None] | None = N
     """The run folder to work in: a new one, which `fill` puts representations into, or the one to go on with."""
     config = options.config
     if options.resume is not None:
-        run = RunFolder.open(options.resume)
-        run.amend(steps=config.steps, track=options.track)
-        return run
+        return RunFolder.open(options.resume)
     name = f"{registry.file_name(config.domain)}-{config.agent}-{memory_of(config)}"
     training = Training(config, parse_seeds(options.seeds), options.track)
     return RunFolder.create(options.out or pathlib.Path("runs") / name, training.as_dict(), fill)
@@ -186,9 +184,18 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     if unread:
         say(f"not read by --agent {config.agent} on {env.name}: {', '.join(unread)}")
     run = open_run(options, fill)
-    title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))
-    say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
+    with run.held():
+        if options.resume is not None:
+            run.amend(steps=config.steps, track=options.track)
+        title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))
+        say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
+        _both_stages(run, env, options, say)
+    return run
 
+
+def _both_stages(run: RunFolder, env: Environment, options: TrainOptions, say: Callable[[str], None]) -> None:
+    """Stage 1 where it is needed and not done, and stage 2 from where it stands."""
+    config, seeds = options.config, parse_seeds(options.seeds)
     clock = CompileClock()
     learnt = None
     if needs_representation(config):
@@ -205,7 +212,6 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
         each.close()
     if finished:
         _conclude(runner, run, env, say)
-    return run
 
 
 def _start(

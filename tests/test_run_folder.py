@@ -1,5 +1,6 @@
 """The run folder survives kills and says what is wrong with it; progress is readable."""
 
+import errno
 import io
 import json
 import sys
@@ -109,6 +110,23 @@ def test_another_budget_makes_a_run_go_on(run):
     run.amend(steps=9000, track="none")
     assert run.summary() is None
     assert run.config() == {**RunFolder.open(run.path).config(), "steps": 9000}
+
+
+def test_two_cannot_work_in_one_run(run):
+    other = RunFolder.open(run.path)
+    with run.held(), pytest.raises(RunError, match="another process is at work in it"), other.held():
+        pass
+    with other.held():
+        pass
+
+
+def test_where_files_cannot_be_locked_work_goes_on(run, monkeypatch):
+    def without_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", without_locks)
+    with run.held():
+        pass
 
 
 def test_unusable_folders_are_named(tmp_path, run):

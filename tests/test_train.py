@@ -109,7 +109,9 @@ def test_a_corrupt_checkpoint_falls_back_to_the_one_before(whole_run: pathlib.Pa
     assert comparable(path, 0) == comparable(whole_run, 0)
 
 
-def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path) -> None:
+def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path,
+                                                     capsys: pytest.CaptureFixture[str]) -> None:
+    """Meanwhile no other process can go on with the run, or change what it is asked for."""
     path = tmp_path / "stopped"
     arguments = ["--agent", "base", "--steps", "100000", *TINY, "--out", str(path)]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -118,6 +120,8 @@ def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path) -> 
     deadline = time.monotonic() + 240
     while time.monotonic() < deadline and not rows.exists() and process.poll() is None:
         time.sleep(0.05)
+    assert train.main(["--resume", str(path), "--steps", "200000"]) == 1
+    assert "another process is at work in it" in capsys.readouterr().err
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=120)
     assert process.returncode == 0
@@ -126,6 +130,7 @@ def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path) -> 
     assert f"--resume {path}" in said
     steps = [int(p.name) for p in (path / "seed_0" / "checkpoints").iterdir() if p.name.isdigit()]
     assert max(steps) == RunFolder.open(path).metrics(0)[-1]["step"]
+    assert RunFolder.open(path).config()["steps"] == 100000
 
 
 @pytest.mark.parametrize(("text", "seeds"), [("5", (0, 1, 2, 3, 4)), ("3,7", (3, 7)), ("3,", (3,))])

@@ -1,4 +1,4 @@
-"""What a command sets before JAX starts: host devices and the persistent compilation cache."""
+"""What a command sets before JAX starts: host devices, the persistent compilation cache, how XLA compiles."""
 
 import ctypes
 import gc
@@ -12,6 +12,10 @@ import jax
 from envs_mjx.errors import UserError
 
 CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+FEW_CORES = 2
+"""With no more, XLA compiles a program as one module and not in parts at once. A CarFlag-2D run then has 1 920 MiB at
+its highest in place of 2 117, with the same seconds of compiling (50.3 and 48.7) and the same numbers."""
+SPLIT = "--xla_cpu_parallel_codegen_split_count"
 
 
 def cores() -> int:
@@ -29,7 +33,10 @@ def prepare(host_devices: int = 1) -> None:
         cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mijax" / "jax"
         jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    if host_devices > 1 and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+    flags = os.environ.get("XLA_FLAGS", "")
+    if cores() <= FEW_CORES and SPLIT not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {SPLIT}=1".strip()
+    if host_devices > 1 and "host_platform_device_count" not in flags:
         jax.config.update("jax_num_cpu_devices", host_devices)
 
 

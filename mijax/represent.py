@@ -63,7 +63,7 @@ def represent(options: RepresentOptions) -> None:
     seeds, env = parse_seeds(options.seeds), registry.make(options.domain)
     check_contract(env)
     run = open_run(options, seeds)
-    with run.held():
+    with run.held(seeds):
         if options.search:
             passed = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print).best.passed
         else:

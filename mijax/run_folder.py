@@ -3,6 +3,7 @@
     RUN/config.json             the run's options; the last file of a new folder, so that it marks a whole one
     RUN/versions.json           python, packages, platform, commit
     RUN/seed_K/metrics.jsonl    one JSON object per evaluation
+    RUN/seed_K/end.json         at the seed's end: its last evaluation, and seconds that its metrics do not have
     RUN/summary.json            at the end: see `mijax.results.summarise`
     RUN/curve.png
 
@@ -20,7 +21,7 @@ import json
 import math
 import os
 import pathlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,9 +56,7 @@ class RunFolder:
             fill: puts representations there, before the run counts as started.
         """
         run = cls(pathlib.Path(path))
-        if run._file("config.json").exists():
-            raise RunError(f"{path}: already holds a run; `python -m mijax.train --resume {path}` goes on with it; "
-                           "choose another --out")
+        run.refuse_taken()
         with _named_errors(run.path):
             run.path.mkdir(parents=True, exist_ok=True)
             started = {"versions.json", f"versions.json{ASIDE}", f"config.json{ASIDE}"}  # a killed start leaves these
@@ -83,8 +82,17 @@ class RunFolder:
             raise RunError(f"{path}: not a run folder of mijax (config.json names no domain)")
         return run
 
+    def refuse_taken(self) -> None:
+        """Raise `RunError` where a new run would find another one."""
+        if self._file("config.json").exists():
+            raise RunError(f"{self.path}: already holds a run; `python -m mijax.train --resume {self.path}` goes on "
+                           "with it; choose another --out")
+
     def discard(self) -> None:
         """Remove a run that could not begin; one that has anything of a seed stays."""
+        for seed in self.seeds():
+            with contextlib.suppress(OSError):
+                self.seed_path(seed).rmdir()
         if self.seeds():
             return
         for name in ("config.json", "versions.json"):
@@ -93,25 +101,27 @@ class RunFolder:
             self.path.rmdir()
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep other processes from working in the folder meanwhile; `RunError` where one does.
+    def held(self, seeds: Sequence[int]) -> Iterator[None]:
+        """Keep other processes from working on these seeds meanwhile; `RunError` where one does.
 
-        The lock is on the folder itself and ends with the process, however that ends. A file system without locks
+        The locks are on the seeds' folders and end with the process, however that ends. A file system without locks
         is worked on without.
         """
-        with _named_errors(self.path):
-            folder = os.open(self.path, os.O_RDONLY)
-        try:
-            try:
-                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise RunError(f"{self.path}: another process is at work in it; wait for its end, or stop it") from None
-            except OSError as error:
-                if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
-                    raise
+        with contextlib.ExitStack() as stack:
+            for seed in seeds:
+                path = self.seed_path(seed)
+                with _named_errors(path):
+                    path.mkdir(exist_ok=True)
+                    folder = os.open(path, os.O_RDONLY)
+                stack.callback(os.close, folder)
+                try:
+                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise RunError(f"{path}: another process is at work in it; wait for its end, or stop it") from None
+                except OSError as error:
+                    if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+                        raise RunError(f"{path}: {error.strerror}") from error
             yield
-        finally:
-            os.close(folder)
 
     def config(self) -> dict[str, Any]:
         """The run's options, as written by `create`."""
@@ -121,7 +131,8 @@ class RunFolder:
         """Go on under another budget of environment steps, so that the run has not ended, or with another tracker."""
         config = self.config()
         if config.get("steps") != steps:
-            self._file("summary.json").unlink(missing_ok=True)
+            for path in (self._file("summary.json"), *self.path.glob("seed_*/end.json")):
+                path.unlink(missing_ok=True)
         changed = config | {"steps": steps, "track": track}
         if changed != config:
             _write_json(self._file("config.json"), changed)
@@ -157,12 +168,21 @@ class RunFolder:
         """All lines of a seed; a last line torn by a kill is dropped, and so are numbers that were not finite."""
         return [{name: value for name, value in row.items() if value is not None} for _, row in self._lines(seed)]
 
-    def truncate_after(self, step: int) -> None:
-        """Drop every seed's lines after `step`, so that a resumed run writes them again."""
-        for seed in self.seeds():
+    def truncate_after(self, step: int, seeds: Sequence[int]) -> None:
+        """Drop these seeds' lines after `step`, so that a resumed run writes them again."""
+        for seed in seeds:
             kept = [line for line, row in self._lines(seed) if row["step"] <= step]
             if self._metrics_file(seed).exists():
                 _write(self._metrics_file(seed), "".join(f"{line}\n" for line in kept))
+
+    def write_end(self, seed: int, end: Mapping[str, Any]) -> None:
+        """Write what a seed came to, for the summary of all."""
+        _write_json(self.seed_path(seed) / "end.json", end)
+
+    def end(self, seed: int) -> dict[str, Any] | None:
+        """What a seed came to, or None while it has not ended."""
+        path = self.seed_path(seed) / "end.json"
+        return _read_json(path) if path.exists() else None
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write summary.json."""

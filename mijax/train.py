@@ -24,16 +24,19 @@ from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of, unread_groups
 from mijax.config import Config, Stage1Config, config_from_dict, options_of, parse_seeds, require
+from mijax.hosts import Host, meet
 from mijax.learner import Learner, make_learner
 from mijax.progress import ProgressDisplay
 from mijax.results import load, summarise
-from mijax.run_folder import RunError, RunFolder
+from mijax.run_folder import RunError, RunFolder, plain
 from mijax.seeds import SeedRunner, training_key
 from mijax.trackers import TrackerName, make_tracker, require_tracker
 from mijax.trained import Training, training_of
 
 FINAL_EPISODES = 500
 """Greedy episodes of each seed behind the numbers of summary.json."""
+FOLDER_SECONDS = 600
+"""How long other hosts wait for the run folder that host 0 makes."""
 
 
 class TrainingError(RunError):
@@ -52,12 +55,15 @@ class TrainOptions:
     out: pathlib.Path | None = None
     """Run folder to make; default runs/DOMAIN-AGENT-MEMORY."""
     resume: pathlib.Path | None = None
-    """Run folder to go on with, under its own options; only --track and --steps may be given with it, and --steps
-    stretches the schedules of step size and imitation."""
+    """Run folder to go on with, under its own options; only --track, --hosts and --steps may be given with it, and
+    --steps stretches the schedules of step size and imitation."""
     representation: pathlib.Path | None = None
     """Run whose stage 1 is taken over instead of training one."""
     track: TrackerName = "none"
     """Where metrics go besides the run folder."""
+    hosts: str = ""
+    """Share the seeds out among several hosts that see the same run folder; the same command on each, with `auto` where
+    JAX finds the hosts itself (SLURM, Open MPI, Kubernetes) or ADDRESS:PORT,INDEX,COUNT, with an address of host 0."""
 
 
 def parse(arguments: Sequence[str]) -> TrainOptions:
@@ -68,6 +74,7 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
     first.add_argument("--resume", type=pathlib.Path)
     first.add_argument("--steps", type=int)
     first.add_argument("--track")
+    first.add_argument("--hosts", default="")
     known, others = first.parse_known_args(list(arguments))
     if known.resume is not None and not {"-h", "--help"} & set(others):
         return _resumed(known, others, arguments)
@@ -82,7 +89,8 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
 
 def _resumed(known: argparse.Namespace, others: Sequence[str], arguments: Sequence[str]) -> TrainOptions:
     stray = [*others, *(word for word in arguments if word.split("=")[0] in ("--domain", "--preset"))]
-    require(not stray, "resume", " ".join(stray), "no option but --steps and --track: a run goes on under its own")
+    require(not stray, "resume", " ".join(stray),
+            "no option but --steps, --track and --hosts: a run goes on under its own")
     run = RunFolder.open(known.resume)
     training = training_of(run)
     config = training.config
@@ -90,7 +98,8 @@ def _resumed(known: argparse.Namespace, others: Sequence[str], arguments: Sequen
         require(known.steps >= config.steps, "steps", known.steps, f"at least the run's {config.steps}")
         config = dataclasses.replace(config, steps=known.steps)
     seeds = ",".join(map(str, training.seeds)) + ","
-    return TrainOptions(config, seeds=seeds, resume=known.resume, track=known.track or training.track)
+    return TrainOptions(config, seeds=seeds, resume=known.resume, track=known.track or training.track,
+                        hosts=known.hosts)
 
 
 def unread_options(config: Config, env: Environment) -> list[str]:
@@ -115,14 +124,31 @@ def _require_kind(source: RunFolder, wanted: Stage1Config) -> None:
             f"a run with features of the other kind: {kinds[wanted.lambda_kl > 0]}")
 
 
-def open_run(options: TrainOptions, fill: Callable[[RunFolder], None] | None = None) -> RunFolder:
-    """The run folder to work in: a new one, which `fill` puts representations into, or the one to go on with."""
+def folder_of(options: TrainOptions) -> pathlib.Path:
+    """Of the run that these options are about, there or not."""
     config = options.config
-    if options.resume is not None:
-        return RunFolder.open(options.resume)
     name = f"{registry.file_name(config.domain)}-{config.agent}-{memory_of(config)}"
-    training = Training(config, parse_seeds(options.seeds), options.track)
-    return RunFolder.create(options.out or pathlib.Path("runs") / name, training.as_dict(), fill)
+    return options.resume or options.out or pathlib.Path("runs") / name
+
+
+def open_run(options: TrainOptions, host: Host, fill: Callable[[RunFolder], None] | None = None) -> RunFolder:
+    """The run folder to work in: a new one, which host 0 makes and `fill` puts representations into, or the one to go
+    on with."""
+    path = folder_of(options)
+    if options.resume is not None:
+        return RunFolder.open(path)
+    asked = Training(options.config, parse_seeds(options.seeds), options.track).as_dict()
+    if host.index == 0:
+        return RunFolder.create(path, asked, fill)
+    deadline = time.monotonic() + FOLDER_SECONDS
+    while not (path / "config.json").exists():
+        if time.monotonic() > deadline:
+            raise RunError(f"{path}: host 0 has not made this run folder; choose an --out that every host sees")
+        time.sleep(0.2)
+    run = RunFolder.open(path)
+    if run.config() != plain(asked):
+        raise RunError(f"{path}: host 0 was given other options; give every host the same")
+    return run
 
 
 class CompileClock:
@@ -167,7 +193,7 @@ class StopRequest:
 
 def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolder:
     """Run or go on with a training; returns its folder."""
-    config, seeds = options.config, parse_seeds(options.seeds)
+    config, every_seed = options.config, parse_seeds(options.seeds)
     require_tracker(options.track)
     env = registry.make(config.domain)
     check_contract(env)
@@ -179,23 +205,29 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
                 f"none: --agent {config.agent} looks through no features here")
         source = RunFolder.open(options.representation)
         _require_kind(source, stage1_of(config))
-        fill = stage1.reuse(source, env, config.stage1.features, seeds)
+        fill = stage1.reuse(source, env, config.stage1.features, every_seed)
     unread = unread_options(config, env)
     if unread:
         say(f"not read by --agent {config.agent} on {env.name}: {', '.join(unread)}")
-    run = open_run(options, fill)
-    with run.held():
-        if options.resume is not None:
-            run.amend(steps=config.steps, track=options.track)
+    if options.resume is None:
+        RunFolder(folder_of(options)).refuse_taken()  # by every host, before host 0 can have made it
+    host = meet(options.hosts)
+    require(host.count <= len(every_seed), "seeds", options.seeds, f"at least one for each of {host.count} hosts")
+    training = Training(config, host.share(every_seed), options.track)
+    run = open_run(options, host, fill)
+    with run.held(training.seeds):
+        if options.resume is not None and host.index == 0:
+            run.amend(steps=config.steps, track=training.track)
         title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))
-        say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, seeds {list(seeds)}")
-        _both_stages(run, env, options, say)
+        say(f"{run.path}: {title} ({config.agent}, {memory_of(config)}) on {env.name}, "
+            f"seeds {list(training.seeds)}")
+        _both_stages(run, env, training, say)
     return run
 
 
-def _both_stages(run: RunFolder, env: Environment, options: TrainOptions, say: Callable[[str], None]) -> None:
+def _both_stages(run: RunFolder, env: Environment, training: Training, say: Callable[[str], None]) -> None:
     """Stage 1 where it is needed and not done, and stage 2 from where it stands."""
-    config, seeds = options.config, parse_seeds(options.seeds)
+    config, seeds = training.config, training.seeds
     clock = CompileClock()
     learnt = None
     if needs_representation(config):
@@ -207,7 +239,7 @@ def _both_stages(run: RunFolder, env: Environment, options: TrainOptions, say: C
     runner = SeedRunner(lambda pack: make_learner(env, config, pack), seeds, config.seeds.strategy)
     checkpoints = checkpoint.open_all(run, seeds, config.checkpoint.keep)
     _start(runner, run, checkpoints, learnt, say)
-    finished = _loop(runner, run, checkpoints, options, clock, say)
+    finished = _loop(runner, run, checkpoints, training, clock, say)
     for each in checkpoints.values():
         each.close()
     if finished:
@@ -224,12 +256,12 @@ def _start(
         template = jax.eval_shape(runner.learner.init, training_key(0), representation)
         step, states = checkpoint.load_latest(checkpoints, template, say)
         runner.restore(states)
-        run.truncate_after(step)
+        run.truncate_after(step, runner.seeds)
         for each in checkpoints.values():
             each.drop_after(step)
         say(f"going on from step {step:,}")
     else:
-        run.truncate_after(-1)
+        run.truncate_after(-1, runner.seeds)
         say(f"stage 2: compiling, then {_prelude(runner.learner)}")
         runner.init(learnt)
         shown = all(runner.learner.has_demonstrations(state) for state in runner.states().values())
@@ -255,12 +287,12 @@ def _prelude(learner: Learner) -> str:
 
 
 def _loop(
-    runner: SeedRunner, run: RunFolder, checkpoints: dict[int, checkpoint.Checkpoints], options: TrainOptions,
+    runner: SeedRunner, run: RunFolder, checkpoints: dict[int, checkpoint.Checkpoints], training: Training,
     clock: CompileClock, say: Callable[[str], None],
 ) -> bool:
     """Chunks, evaluations, metrics and checkpoints up to the run's steps; False when asked to stop before."""
-    config = options.config
-    tracker, stop = make_tracker(options.track, run), StopRequest(say)
+    config = training.config
+    tracker, stop = make_tracker(training.track, run), StopRequest(say)
     agent, evaluations = runner.learner.agent, 0
 
     def save() -> None:
@@ -330,19 +362,30 @@ def _overview(rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:
 
 
 def _conclude(runner: SeedRunner, run: RunFolder, env: Environment, say: Callable[[str], None]) -> None:
-    """The last evaluation, summary.json, curve.png and the table."""
+    """The last evaluation of every seed here; summary.json, curve.png and the table once all seeds of the run ended."""
     final = runner.evaluate(FINAL_EPISODES)
+    environment = runner.environment_seconds() / len(runner.seeds)
+    for seed in runner.seeds:
+        run.write_end(seed, {"evaluation": final[seed], "stage1": stage1.seconds_of(run, seed),
+                             "environment": environment})
+    ends = {seed: run.end(seed) for seed in training_of(run).seeds}
+    ended = {seed: end for seed, end in ends.items() if end is not None}
+    if len(ended) < len(ends):
+        learning = [seed for seed in ends if seed not in ended]
+        say(f"seeds {list(runner.seeds)} have ended; seeds {learning} are at work elsewhere, the last writes the "
+            "summary")
+        return
     best = optimum(env, runner.learner.config.evaluation.discount)
     values = None if best is None else {
         "return": best.undiscounted_return, "discounted_return": best.discounted_return, "success": best.success,
         "length": best.length}
-    wall = {seed: {"stage1": stage1.seconds_of(run, seed)} for seed in runner.seeds}
-    summary = summarise(run, optimum=values, final=final, wall=wall)
-    environment = runner.environment_seconds() / len(runner.seeds)
-    for result in summary["seeds"].values():
-        training = result["wall"].pop("training", 0.0)
-        result["wall"]["environment"] = min(environment, training)
-        result["wall"]["update"] = training - result["wall"]["environment"]
+    summary = summarise(run, optimum=values, final={seed: end["evaluation"] for seed, end in ended.items()},
+                        wall={seed: {"stage1": end["stage1"]} for seed, end in ended.items()})
+    for seed, end in ended.items():
+        wall = summary["seeds"][str(seed)]["wall"]
+        training = wall.pop("training", 0.0)
+        wall["environment"] = min(end["environment"], training)
+        wall["update"] = training - wall["environment"]
     run.write_summary(summary)
     say(report.write_report(load([run.path]), run.path))
 

@@ -87,10 +87,10 @@ def test_a_torn_last_line_is_dropped_and_a_resumed_run_writes_the_same_file(run)
     for kept in range(len(whole.split(b"\n", 2)[0]) + 1, len(whole)):  # killed at any byte after the first line
         path.write_bytes(whole[:kept])
         last = run.metrics(0)[-1]["step"]
-        run.truncate_after(last)
+        run.truncate_after(last, [0])
         write(last + 1)
         assert path.read_bytes() == whole
-    run.truncate_after(2)
+    run.truncate_after(2, [0])
     assert [row["step"] for row in run.metrics(0)] == [1, 2]
 
 
@@ -123,11 +123,14 @@ def test_another_budget_makes_a_run_go_on(run):
     assert run.config() == {**RunFolder.open(run.path).config(), "steps": 9000}
 
 
-def test_two_cannot_work_in_one_run(run):
+def test_two_cannot_work_on_one_seed(run):
     other = RunFolder.open(run.path)
-    with run.held(), pytest.raises(RunError, match="another process is at work in it"), other.held():
-        pass
-    with other.held():
+    with run.held([0, 3]):
+        with pytest.raises(RunError, match="seed_3: another process is at work in it"), other.held([1, 3]):
+            pass
+        with other.held([1]):  # a host's own share
+            pass
+    with other.held([1, 3]):
         pass
 
 
@@ -136,7 +139,7 @@ def test_where_files_cannot_be_locked_work_goes_on(run, monkeypatch):
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr("fcntl.flock", without_locks)
-    with run.held():
+    with run.held([0]):
         pass
 
 

@@ -6,6 +6,7 @@ import os
 import pathlib
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -35,6 +36,17 @@ def comparable(run: pathlib.Path, seed: int) -> list[dict]:
     """A seed's metrics without the seconds."""
     rows = RunFolder.open(run).metrics(seed)
     return [{name: value for name, value in row.items() if not name.startswith("wall/")} for row in rows]
+
+
+def without_seconds(seeds: dict[str, dict]) -> dict[str, dict]:
+    """What a summary says of its seeds, but for the seconds."""
+    return {seed: {name: value for name, value in result.items() if name != "wall"} for seed, result in seeds.items()}
+
+
+def free_port() -> int:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +106,31 @@ def test_killed_and_resumed_is_never_interrupted(whole_run: pathlib.Path, tmp_pa
     for seed in (0, 3):
         assert comparable(path, seed) == comparable(whole_run, seed)
         assert same_file(path, whole_run, seed, "probe.json")
+
+
+def test_two_hosts_share_the_seeds(whole_run: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    """Each writes its own seed's files, and the last the summary: the run is what one host makes of it."""
+    path, port = tmp_path / "shared", free_port()
+    arguments = ["--domain", "heaven_hell", "--seeds", "0,3", "--steps", "1200", *TINY, "--out", str(path),
+                 "--representation", str(whole_run)]
+    hosts = [subprocess.Popen(command(*arguments, "--hosts", f"127.0.0.1:{port},{index},2"), text=True,
+                              stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for index in range(2)]
+    said = [host.communicate(timeout=400)[0] for host in hosts]
+    assert [host.returncode for host in hosts] == [0, 0], said
+    assert "seeds [0]" in said[0]
+    assert "seeds [3]" in said[1]
+    for seed in (0, 3):
+        assert comparable(path, seed) == comparable(whole_run, seed)
+    there, alone = (json.loads((run / "summary.json").read_text())["seeds"] for run in (path, whole_run))
+    assert without_seconds(there) == without_seconds(alone)
+
+
+def test_hosts_that_do_not_meet(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--agent", "base", "--steps", "1200", *TINY, "--out", str(tmp_path / "run")]
+    assert train.main([*arguments, "--hosts", "auto"]) == 1
+    assert "--hosts auto: the hosts did not meet: " in capsys.readouterr().err
+    assert train.main([*arguments, "--hosts", f"127.0.0.1:{free_port()},0,1", "--seeds", "0,"]) == 0
+    assert RunFolder.open(tmp_path / "run").summary() is not None
 
 
 def test_a_corrupt_checkpoint_falls_back_to_the_one_before(whole_run: pathlib.Path, tmp_path: pathlib.Path,
@@ -166,6 +203,8 @@ def test_a_stored_configuration_comes_back() -> None:
     (["--evaluation.every", "33"], "--evaluation.every"),
     (["--resume", "/nonexistent"], "/nonexistent"),
     (["--domain", "json:dumps"], "json"),
+    (["--hosts", "here"], "--hosts"),
+    (["--hosts", "10.0.0.1:4321,2,2"], "an index below the count"),
 ])
 def test_bad_input_is_one_line_and_leaves_nothing(
     arguments: list[str], named: str, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]

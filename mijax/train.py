@@ -211,6 +211,8 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
         say(f"not read by --agent {config.agent} on {env.name}: {', '.join(unread)}")
     if options.resume is None:
         RunFolder(folder_of(options)).refuse_taken()  # by every host, before host 0 can have made it
+    if options.hosts:
+        say(f"--hosts {options.hosts}: waiting for the other hosts")
     host = meet(options.hosts)
     require(host.count <= len(every_seed), "seeds", options.seeds, f"at least one for each of {host.count} hosts")
     training = Training(config, host.share(every_seed), options.track)

@@ -40,6 +40,7 @@ from mijax.trained import load_learner_state, stage1_in, training_of
 PAPER_SEEDS = 5
 TRACED_EPISODES = 100
 """Episodes of each seed behind the numbers of Fig. 32."""
+SET_BY_EXPERIMENT = ("--agent", "--memory", "--resume", "--representation", "--hosts")
 SAY: Callable[[str], None] = print
 
 
@@ -136,8 +137,9 @@ def shared_features(request: Request, domain: str, features: str, options: train
         run = RunFolder.create(path, {"domain": domain, "stage1": dataclasses.asdict(config.stage1)})
     env = registry.make(domain)
     for seed in request.seeds:
-        if not (stage1.folder_of(run, seed) / FACTS_FILE).exists():
-            stage1.learn(run, env, config.stage1, seed, SAY)
+        with run.held([seed]):
+            if not (stage1.folder_of(run, seed) / FACTS_FILE).exists():
+                stage1.learn(run, env, config.stage1, seed, SAY)
     return path
 
 
@@ -304,7 +306,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, Request]:
     if known.experiment not in (*EXPERIMENTS, "all"):
         raise ConfigError(f"experiment: got {known.experiment!r}, accepted: {accepted}")
     require(known.steps is None or known.steps >= 1, "steps", known.steps, "a number >= 1")
-    reserved = [word for word in extra if word.split("=")[0] in ("--agent", "--memory", "--resume", "--representation")]
+    reserved = [word for word in extra if word.split("=")[0] in SET_BY_EXPERIMENT]
     require(not reserved, (reserved[0] if reserved else "").lstrip("-"), "a value",
             "nothing here, the experiment sets it")
     seeds = parse_seeds(known.seeds)

@@ -58,7 +58,7 @@ from mijax.run_folder import RunError, RunFolder
 State = Literal["waiting", "submitted", "running", "done", "failed", "stopped"]
 KEYS = ("options", "grid", "seeds", "seeds_per_job", "resources", "retries")
 RESOURCES = ("cpus", "gpus")
-SET_BY_SWEEP = ("seeds", "out", "resume")
+SET_BY_SWEEP = ("seeds", "out", "resume", "hosts")
 REFRESH_SECONDS = 2.0
 STOP = signal.SIGTERM
 """Asks a run to save and end. Ctrl-C's signal would be ignored by what a shell has started in the background."""

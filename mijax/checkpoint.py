@@ -103,6 +103,24 @@ def open_all(run: RunFolder, seeds: Sequence[int], keep: int = 2) -> dict[int, C
     return {seed: Checkpoints(run, seed, keep) for seed in seeds}
 
 
+def abreast(run: RunFolder, seeds: Sequence[int]) -> list[tuple[int, ...]]:
+    """Seeds in groups that can go on together, as all of a group have a checkpoint of the same step, or none has any:
+    one group, unless a run that several hosts shared is gone on with by fewer, or was killed at its first checkpoint.
+    """
+    groups: list[tuple[set[int], list[int]]] = []
+    for seed in seeds:
+        checkpoints = Checkpoints(run, seed)
+        steps = set(checkpoints.steps())
+        checkpoints.close()
+        for index, (common, members) in enumerate(groups):
+            if common & steps or not (common or steps):
+                groups[index] = (common & steps, [*members, seed])
+                break
+        else:
+            groups.append((steps, [seed]))
+    return [tuple(members) for _, members in groups]
+
+
 def exists(run: RunFolder, seeds: Sequence[int]) -> bool:
     """Whether every seed has at least one checkpoint folder with something in it."""
     folders = (pathlib.Path(run.seed_path(seed)) / FOLDER for seed in seeds)

@@ -36,9 +36,9 @@ class Host:
 
 
 def check(hosts: str) -> None:
-    """Raise `ConfigError` unless `hosts` is what --hosts accepts."""
+    """Raise `ConfigError` unless `hosts` is what --hosts accepts, or empty."""
     found = EXPLICIT.fullmatch(hosts)
-    if hosts != "auto" and not (found and int(found["index"]) < int(found["count"])):
+    if hosts not in ("", "auto") and not (found and int(found["index"]) < int(found["count"])):
         raise ConfigError(f"--hosts: got {hosts!r}, accepted: {ACCEPTED}")
 
 
@@ -53,23 +53,25 @@ def meet(hosts: str) -> Host:
     """
     if not hosts:
         return Host()
-    check(hosts)
     # On a CPU: an accelerator's memory is left to the process that trains.
     done = subprocess.run([sys.executable, "-m", "mijax.hosts", hosts], capture_output=True, text=True, check=False,
                           env=os.environ | {"JAX_PLATFORMS": "cpu"})
     if done.returncode != 0:
         said = done.stderr.strip().splitlines() or ["no reason given"]
         raise ConfigError(f"--hosts {hosts}: the hosts did not meet: {said[-1]}")
-    return Host(*json.loads(done.stdout))
+    return Host(*json.loads(done.stdout.splitlines()[-1]))
 
 
 def _meet(hosts: str) -> None:
     """Say index and count on standard output."""
     found = EXPLICIT.fullmatch(hosts)
-    if found is None:
-        jax.distributed.initialize()
-    else:
-        jax.distributed.initialize(found["address"], int(found["count"]), int(found["index"]))
+    try:
+        if found is None:
+            jax.distributed.initialize()
+        else:
+            jax.distributed.initialize(found["address"], int(found["count"]), int(found["index"]))
+    except Exception as error:  # JAX's kinds differ by cause; the first of their lines says it
+        sys.exit(str(error).splitlines()[0])
     print(json.dumps([jax.process_index(), jax.process_count()]))
     jax.distributed.shutdown()
 

@@ -4,6 +4,7 @@
     RUN/versions.json           python, packages, platform, commit
     RUN/seed_K/metrics.jsonl    one JSON object per evaluation
     RUN/seed_K/end.json         at the seed's end: its last evaluation, and seconds that its metrics do not have
+    RUN/seed_K/lock             empty: locked while a process works on the seed
     RUN/summary.json            at the end: see `mijax.results.summarise`
     RUN/curve.png
 
@@ -30,6 +31,7 @@ from envs_mjx.errors import UserError
 from mijax.files import ASIDE, write_atomically
 from mijax.versions import current_versions
 
+LOCK = "lock"
 Row = dict[str, Any]
 """A line of metrics."""
 
@@ -88,12 +90,15 @@ class RunFolder:
             raise RunError(f"{self.path}: already holds a run; `python -m mijax.train --resume {self.path}` goes on "
                            "with it; choose another --out")
 
-    def discard(self) -> None:
-        """Remove a run that could not begin; one that has anything of a seed stays."""
-        for seed in self.seeds():
-            with contextlib.suppress(OSError):
-                self.seed_path(seed).rmdir()
-        if self.seeds():
+    def discard(self, seeds: Sequence[int]) -> None:
+        """Remove a run of these seeds that could not begin; one that has anything of a seed, or others, stays."""
+        for seed in seeds:
+            path = self.seed_path(seed)
+            if {entry.name for entry in path.glob("*")} <= {LOCK}:
+                (path / LOCK).unlink(missing_ok=True)
+                with contextlib.suppress(OSError):
+                    path.rmdir()
+        if self.seeds() or set(seeds) != set(self.config().get("seed_list", seeds)):
             return
         for name in ("config.json", "versions.json"):
             self._file(name).unlink(missing_ok=True)
@@ -104,23 +109,22 @@ class RunFolder:
     def held(self, seeds: Sequence[int]) -> Iterator[None]:
         """Keep other processes from working on these seeds meanwhile; `RunError` where one does.
 
-        The locks are on the seeds' folders and end with the process, however that ends. A file system without locks
-        is worked on without.
+        The locks end with the process, however that ends. A file system without locks, or whose locks other hosts do
+        not see, is worked on without.
         """
         with contextlib.ExitStack() as stack:
             for seed in seeds:
                 path = self.seed_path(seed)
                 with _named_errors(path):
                     path.mkdir(exist_ok=True)
-                    folder = os.open(path, os.O_RDONLY)
-                stack.callback(os.close, folder)
-                try:
-                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    raise RunError(f"{path}: another process is at work in it; wait for its end, or stop it") from None
-                except OSError as error:
-                    if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
-                        raise RunError(f"{path}: {error.strerror}") from error
+                if not stack.enter_context(_locked(path / LOCK, wait=False)):
+                    raise RunError(f"{path}: another process is at work in it; wait for its end, or stop it")
+            yield
+
+    @contextlib.contextmanager
+    def concluding(self) -> Iterator[None]:
+        """One process after the other: for what is about all seeds."""
+        with _locked(self._file(LOCK), wait=True):
             yield
 
     def config(self) -> dict[str, Any]:
@@ -131,8 +135,7 @@ class RunFolder:
         """Go on under another budget of environment steps, so that the run has not ended, or with another tracker."""
         config = self.config()
         if config.get("steps") != steps:
-            for path in (self._file("summary.json"), *self.path.glob("seed_*/end.json")):
-                path.unlink(missing_ok=True)
+            self._file("summary.json").unlink(missing_ok=True)
         changed = config | {"steps": steps, "track": track}
         if changed != config:
             _write_json(self._file("config.json"), changed)
@@ -169,20 +172,22 @@ class RunFolder:
         return [{name: value for name, value in row.items() if value is not None} for _, row in self._lines(seed)]
 
     def truncate_after(self, step: int, seeds: Sequence[int]) -> None:
-        """Drop these seeds' lines after `step`, so that a resumed run writes them again."""
+        """Drop these seeds' lines after `step`, and what they came to, so that a resumed run writes them again."""
         for seed in seeds:
+            (self.seed_path(seed) / "end.json").unlink(missing_ok=True)
             kept = [line for line, row in self._lines(seed) if row["step"] <= step]
             if self._metrics_file(seed).exists():
                 _write(self._metrics_file(seed), "".join(f"{line}\n" for line in kept))
 
-    def write_end(self, seed: int, end: Mapping[str, Any]) -> None:
-        """Write what a seed came to, for the summary of all."""
-        _write_json(self.seed_path(seed) / "end.json", end)
+    def write_end(self, seed: int, step: int, end: Mapping[str, Any]) -> None:
+        """Write what a seed came to at its last step, for the summary of all."""
+        _write_json(self.seed_path(seed) / "end.json", {"step": step, **end})
 
-    def end(self, seed: int) -> dict[str, Any] | None:
-        """What a seed came to, or None while it has not ended."""
+    def end(self, seed: int, step: int) -> dict[str, Any] | None:
+        """What a seed came to, or None while it has not ended at this step."""
         path = self.seed_path(seed) / "end.json"
-        return _read_json(path) if path.exists() else None
+        end = _read_json(path) if path.exists() else {}
+        return end if end.get("step") == step else None
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write summary.json."""
@@ -229,6 +234,26 @@ def plain(value: Any) -> Any:
         return os.fspath(value)
     number = np.asarray(value).item()
     return None if isinstance(number, float) and not math.isfinite(number) else number
+
+
+@contextlib.contextmanager
+def _locked(path: pathlib.Path, *, wait: bool) -> Iterator[bool]:
+    """Whether a file could be locked; where files cannot be, always. A file and not a folder, and open for writing:
+    NFS shows no other lock to other hosts."""
+    with _named_errors(path):
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            locked = True
+        except OSError as error:
+            locked = error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
+            if not locked and error.errno not in (errno.EAGAIN, errno.EACCES):
+                os.close(file)
+                raise
+    try:
+        yield locked
+    finally:
+        os.close(file)
 
 
 @contextlib.contextmanager

@@ -13,8 +13,9 @@ from envs_mjx.errors import UserError
 
 CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 FEW_CORES = 2
-"""With no more, XLA compiles a program as one module and not in parts at once. A CarFlag-2D run then has 1 920 MiB at
-its highest in place of 2 117, with the same seconds of compiling (50.3 and 48.7) and the same numbers."""
+"""On at most so many XLA compiles a program as one module, and not in parts side by side. One CarFlag-2D seed: 1 920
+MiB at its highest, 2 117 with XLA's default; 50.3 and 48.7 s of compiling, one run each on busy cores. The numbers that
+it learns by are the same."""
 SPLIT = "--xla_cpu_parallel_codegen_split_count"
 
 
@@ -43,7 +44,8 @@ def prepare(host_devices: int = 1) -> None:
 def release_memory() -> None:
     """Give memory that compiling has left over back to the system, where glibc can.
 
-    A CarFlag-2D learner keeps 978 MiB with it and 1 869 without: LLVM's heap is free, but stays with the process.
+    A CarFlag-2D learner, compiled in parts, keeps 978 MiB with it and 1 869 without: LLVM's heap is free, but stays
+    with the process.
     """
     gc.collect()
     if sys.platform == "linux":

@@ -24,11 +24,11 @@ from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of, unread_groups
 from mijax.config import Config, Stage1Config, config_from_dict, options_of, parse_seeds, require
-from mijax.hosts import Host, meet
+from mijax.hosts import Host, check, meet
 from mijax.learner import Learner, make_learner
 from mijax.progress import ProgressDisplay
 from mijax.results import load, summarise
-from mijax.run_folder import RunError, RunFolder, plain
+from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import SeedRunner, training_key
 from mijax.trackers import TrackerName, make_tracker, require_tracker
 from mijax.trained import Training, training_of
@@ -36,7 +36,7 @@ from mijax.trained import Training, training_of
 FINAL_EPISODES = 500
 """Greedy episodes of each seed behind the numbers of summary.json."""
 FOLDER_SECONDS = 600
-"""How long other hosts wait for the run folder that host 0 makes."""
+"""How long other hosts wait for host 0 to make the run folder, or to write a resumed run's new budget there."""
 
 
 class TrainingError(RunError):
@@ -62,8 +62,9 @@ class TrainOptions:
     track: TrackerName = "none"
     """Where metrics go besides the run folder."""
     hosts: str = ""
-    """Share the seeds out among several hosts that see the same run folder; the same command on each, with `auto` where
-    JAX finds the hosts itself (SLURM, Open MPI, Kubernetes) or ADDRESS:PORT,INDEX,COUNT, with an address of host 0."""
+    """Share the seeds out among several hosts that see the same run folder, one process on each: `auto` where JAX finds
+    the hosts itself (SLURM, Open MPI, Kubernetes), or ADDRESS:PORT,INDEX,COUNT with an address of host 0 and an INDEX
+    that differs; everything else is the same on each."""
 
 
 def parse(arguments: Sequence[str]) -> TrainOptions:
@@ -125,7 +126,7 @@ def _require_kind(source: RunFolder, wanted: Stage1Config) -> None:
 
 
 def folder_of(options: TrainOptions) -> pathlib.Path:
-    """Of the run that these options are about, there or not."""
+    """The run's folder, whether it exists or not."""
     config = options.config
     name = f"{registry.file_name(config.domain)}-{config.agent}-{memory_of(config)}"
     return options.resume or options.out or pathlib.Path("runs") / name
@@ -135,20 +136,16 @@ def open_run(options: TrainOptions, host: Host, fill: Callable[[RunFolder], None
     """The run folder to work in: a new one, which host 0 makes and `fill` puts representations into, or the one to go
     on with."""
     path = folder_of(options)
-    if options.resume is not None:
-        return RunFolder.open(path)
     asked = Training(options.config, parse_seeds(options.seeds), options.track).as_dict()
     if host.index == 0:
-        return RunFolder.create(path, asked, fill)
+        return RunFolder.create(path, asked, fill) if options.resume is None else RunFolder.open(path)
     deadline = time.monotonic() + FOLDER_SECONDS
-    while not (path / "config.json").exists():
+    while not (path / "config.json").exists() or training_of(RunFolder.open(path)).as_dict() != asked:
         if time.monotonic() > deadline:
-            raise RunError(f"{path}: host 0 has not made this run folder; choose an --out that every host sees")
+            raise RunError(f"{path}: host 0 has not begun this run; give every host the same options, and an --out "
+                           "that every host sees")
         time.sleep(0.2)
-    run = RunFolder.open(path)
-    if run.config() != plain(asked):
-        raise RunError(f"{path}: host 0 was given other options; give every host the same")
-    return run
+    return RunFolder.open(path)
 
 
 class CompileClock:
@@ -195,6 +192,7 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     """Run or go on with a training; returns its folder."""
     config, every_seed = options.config, parse_seeds(options.seeds)
     require_tracker(options.track)
+    check(options.hosts)
     env = registry.make(config.domain)
     check_contract(env)
     fill = None  # what cannot be trained is refused before anything is written
@@ -214,7 +212,8 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     if options.hosts:
         say(f"--hosts {options.hosts}: waiting for the other hosts")
     host = meet(options.hosts)
-    require(host.count <= len(every_seed), "seeds", options.seeds, f"at least one for each of {host.count} hosts")
+    require(host.count <= len(every_seed), "hosts", options.hosts,
+            f"at most {len(every_seed)} hosts, one for each seed, and {host.count} have met")
     training = Training(config, host.share(every_seed), options.track)
     run = open_run(options, host, fill)
     with run.held(training.seeds):
@@ -236,15 +235,17 @@ def _both_stages(run: RunFolder, env: Environment, training: Training, say: Call
         try:
             learnt = stage1.representations(run, env, stage1_of(config), seeds, say)
         except UserError:
-            run.discard()  # options that stage 1 cannot do anything with are no run to go on with
+            run.discard(seeds)  # options that stage 1 cannot do anything with are no run to go on with
             raise
-    runner = SeedRunner(lambda pack: make_learner(env, config, pack), seeds, config.seeds.strategy)
-    checkpoints = checkpoint.open_all(run, seeds, config.checkpoint.keep)
-    _start(runner, run, checkpoints, learnt, say)
-    finished = _loop(runner, run, checkpoints, training, clock, say)
-    for each in checkpoints.values():
-        each.close()
-    if finished:
+    for abreast in checkpoint.abreast(run, seeds):
+        runner = SeedRunner(lambda pack: make_learner(env, config, pack), abreast, config.seeds.strategy)
+        checkpoints = checkpoint.open_all(run, abreast, config.checkpoint.keep)
+        _start(runner, run, checkpoints, learnt, say)
+        finished = _loop(runner, run, checkpoints, training, clock, say)
+        for each in checkpoints.values():
+            each.close()
+        if not finished:
+            break
         _conclude(runner, run, env, say)
 
 
@@ -368,28 +369,28 @@ def _conclude(runner: SeedRunner, run: RunFolder, env: Environment, say: Callabl
     final = runner.evaluate(FINAL_EPISODES)
     environment = runner.environment_seconds() / len(runner.seeds)
     for seed in runner.seeds:
-        run.write_end(seed, {"evaluation": final[seed], "stage1": stage1.seconds_of(run, seed),
-                             "environment": environment})
-    ends = {seed: run.end(seed) for seed in training_of(run).seeds}
-    ended = {seed: end for seed, end in ends.items() if end is not None}
-    if len(ended) < len(ends):
-        learning = [seed for seed in ends if seed not in ended]
-        say(f"seeds {list(runner.seeds)} have ended; seeds {learning} are at work elsewhere, the last writes the "
-            "summary")
-        return
-    best = optimum(env, runner.learner.config.evaluation.discount)
-    values = None if best is None else {
-        "return": best.undiscounted_return, "discounted_return": best.discounted_return, "success": best.success,
-        "length": best.length}
-    summary = summarise(run, optimum=values, final={seed: end["evaluation"] for seed, end in ended.items()},
-                        wall={seed: {"stage1": end["stage1"]} for seed, end in ended.items()})
-    for seed, end in ended.items():
-        wall = summary["seeds"][str(seed)]["wall"]
-        training = wall.pop("training", 0.0)
-        wall["environment"] = min(end["environment"], training)
-        wall["update"] = training - wall["environment"]
-    run.write_summary(summary)
-    say(report.write_report(load([run.path]), run.path))
+        run.write_end(seed, runner.step, {"evaluation": final[seed], "stage1": stage1.seconds_of(run, seed),
+                                          "environment": environment})
+    with run.concluding():
+        ends = {seed: run.end(seed, runner.step) for seed in training_of(run).seeds}
+        ended = {seed: end for seed, end in ends.items() if end is not None}
+        if len(ended) < len(ends):
+            left = [seed for seed in ends if seed not in ended]
+            say(f"seeds {list(runner.seeds)} have ended, seeds {left} have not: whoever ends last writes the summary")
+            return
+        best = optimum(env, runner.learner.config.evaluation.discount)
+        values = None if best is None else {
+            "return": best.undiscounted_return, "discounted_return": best.discounted_return, "success": best.success,
+            "length": best.length}
+        summary = summarise(run, optimum=values, final={seed: end["evaluation"] for seed, end in ended.items()},
+                            wall={seed: {"stage1": end["stage1"]} for seed, end in ended.items()})
+        for seed, end in ended.items():
+            wall = summary["seeds"][str(seed)]["wall"]
+            training = wall.pop("training", 0.0)
+            wall["environment"] = min(end["environment"], training)
+            wall["update"] = training - wall["environment"]
+        run.write_summary(summary)
+        say(report.write_report(load([run.path]), run.path))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -156,6 +156,7 @@ def test_a_run_that_was_stopped_goes_on(done: pathlib.Path, monkeypatch: pytest.
     (["fig3", "--steps", "0"], "--steps: got 0"),
     (["fig3", "--arms", "mi,me"], "--arms: got 'mi,me', accepted: some of mi,base,zp,ba,ua,believer"),
     (["fig3", "--agent", "mi"], "--agent: got 'a value', accepted: nothing here"),
+    (["fig3", "--hosts", "auto"], "--hosts: got 'a value', accepted: nothing here"),
 ])
 def test_bad_input_is_one_line(
     tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str

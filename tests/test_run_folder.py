@@ -134,6 +134,26 @@ def test_two_cannot_work_on_one_seed(run):
         pass
 
 
+def test_a_run_that_could_not_begin_is_removed_unless_it_has_others(tmp_path):
+    run = RunFolder.create(tmp_path / "run", {**CONFIG, "seed_list": [0, 3]})
+    with run.held([0]), RunFolder.open(run.path).held([3]):
+        run.discard([3])
+        assert run.seeds() == (0,)
+        assert RunFolder.open(run.path).config()["seed_list"] == [0, 3]
+    run.discard([0, 3])
+    assert not run.path.exists()
+
+
+def test_what_a_seed_came_to_is_of_one_step(run):
+    with run.held([0]):
+        run.write_end(0, 1200, {"evaluation": {"success": 1.0}})
+    assert run.end(0, 1200) == {"step": 1200, "evaluation": {"success": 1.0}}
+    assert run.end(0, 2400) is None
+    assert run.end(1, 1200) is None
+    run.truncate_after(600, [0])
+    assert run.end(0, 1200) is None
+
+
 def test_where_files_cannot_be_locked_work_goes_on(run, monkeypatch):
     def without_locks(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")

@@ -63,6 +63,7 @@ def test_every_combination_is_a_job(tmp_path: pathlib.Path):
     ("grid: {agent: [mi]}\nresources: {tpus: 1}", "the keys cpus, gpus"),
     ("grid: {agent: [mi]}\nresources: {cpus: 0}", "spec resources.cpus: got 0"),
     ("grid: {out: [a]}", "spec out: got 'out', accepted: nothing here"),
+    ("options: {hosts: auto}\ngrid: {agent: [mi]}", "spec hosts: got 'hosts', accepted: nothing here"),
     ("grid: {agent: [mi]}\nseeds_per_job: 0", "spec seeds_per_job: got 0"),
     ("grid: {dqn.learning-rate: [fast]}", "dqn.learning-rate=fast: options .* are not accepted"),
     ("grid: {dqn.learning-rate: [-1.0]}", "dqn.learning-rate"),

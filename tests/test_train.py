@@ -16,6 +16,7 @@ import pytest
 
 from mijax import train
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds
+from mijax.hosts import Host
 from mijax.run_folder import RunError, RunFolder
 
 pytestmark = pytest.mark.lenient
@@ -115,22 +116,40 @@ def test_two_hosts_share_the_seeds(whole_run: pathlib.Path, tmp_path: pathlib.Pa
                  "--representation", str(whole_run)]
     hosts = [subprocess.Popen(command(*arguments, "--hosts", f"127.0.0.1:{port},{index},2"), text=True,
                               stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for index in range(2)]
-    said = [host.communicate(timeout=400)[0] for host in hosts]
+    try:
+        said = [host.communicate(timeout=400)[0] for host in hosts]
+    finally:
+        for host in hosts:
+            host.kill()
     assert [host.returncode for host in hosts] == [0, 0], said
     assert "seeds [0]" in said[0]
     assert "seeds [3]" in said[1]
+    assert sum("whoever ends last writes the summary" in text for text in said) == 1
     for seed in (0, 3):
         assert comparable(path, seed) == comparable(whole_run, seed)
     there, alone = (json.loads((run / "summary.json").read_text())["seeds"] for run in (path, whole_run))
     assert without_seconds(there) == without_seconds(alone)
 
 
-def test_hosts_that_do_not_meet(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("count", "shares"), [(1, [(4, 5, 9)]), (2, [(4, 9), (5,)]), (3, [(4,), (5,), (9,)])])
+def test_hosts_share_seeds_out(count: int, shares: list[tuple[int, ...]]) -> None:
+    assert [Host(index, count).share((4, 5, 9)) for index in range(count)] == shares
+
+
+def test_what_hosts_cannot_do(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str],
+                              monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in os.environ if name.startswith(("SLURM_", "OMPI_", "KUBERNETES_"))]:
+        monkeypatch.delenv(name)  # else this machine is one of several hosts
     arguments = ["--agent", "base", "--steps", "1200", *TINY, "--out", str(tmp_path / "run")]
     assert train.main([*arguments, "--hosts", "auto"]) == 1
     assert "--hosts auto: the hosts did not meet: " in capsys.readouterr().err
-    assert train.main([*arguments, "--hosts", f"127.0.0.1:{free_port()},0,1", "--seeds", "0,"]) == 0
-    assert RunFolder.open(tmp_path / "run").summary() is not None
+    monkeypatch.setattr(train, "meet", lambda _: Host(1, 2))
+    assert train.main([*arguments, "--hosts", "auto"]) == 1
+    assert "--hosts: got auto, accepted: at most 1 hosts" in capsys.readouterr().err.replace("'", "")
+    monkeypatch.setattr(train, "FOLDER_SECONDS", 0)
+    assert train.main([*arguments, "--seeds", "2", "--hosts", "auto"]) == 1
+    assert "host 0 has not begun this run" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_corrupt_checkpoint_falls_back_to_the_one_before(whole_run: pathlib.Path, tmp_path: pathlib.Path,
@@ -157,10 +176,14 @@ def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path,
     deadline = time.monotonic() + 240
     while time.monotonic() < deadline and not rows.exists() and process.poll() is None:
         time.sleep(0.05)
-    assert train.main(["--resume", str(path), "--steps", "200000"]) == 1
-    assert "another process is at work in it" in capsys.readouterr().err
-    process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=120)
+    try:
+        assert process.poll() is None
+        assert train.main(["--resume", str(path), "--steps", "200000"]) == 1
+        assert "another process is at work in it" in capsys.readouterr().err
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=120)
+    finally:
+        process.kill()
     assert process.returncode == 0
     assert "stage 2: compiling, then " in said
     assert "random steps" in said
@@ -243,19 +266,25 @@ def test_what_does_not_go_with_a_run_is_refused(
     assert {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")} == before
 
 
-def test_a_kill_between_the_first_checkpoints_of_two_seeds_starts_over(
+def test_seeds_that_are_not_abreast_go_on_one_after_the_other(
     whole_run: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """One of two hosts was lost before its first checkpoint: what the other has learnt is kept."""
     path = tmp_path / "half"
     shutil.copytree(whole_run, path)
-    shutil.rmtree(path / "seed_3" / "checkpoints")  # it has none yet, and seed 0 its first
-    checkpoints = path / "seed_0" / "checkpoints"
-    (checkpoints / "1000").rename(checkpoints / "400")
-    shutil.rmtree(checkpoints / "1200")
+    (path / "summary.json").unlink()
+    for name in ("checkpoints", "metrics.jsonl", "end.json"):
+        there = path / "seed_3" / name
+        shutil.rmtree(there) if there.is_dir() else there.unlink()
+    before = (path / "seed_0" / "metrics.jsonl").read_bytes()
     assert train.main(["--resume", str(path)]) == 0
-    assert "going on" not in capsys.readouterr().out
-    for seed in (0, 3):
-        assert comparable(path, seed) == comparable(whole_run, seed)
+    said = capsys.readouterr().out
+    assert "going on from step 1,200" in said
+    assert "seeds [0] have ended, seeds [3] have not" in said
+    assert (path / "seed_0" / "metrics.jsonl").read_bytes() == before
+    assert comparable(path, 3) == comparable(whole_run, 3)
+    there, alone = (json.loads((run / "summary.json").read_text())["seeds"] for run in (path, whole_run))
+    assert without_seconds(there) == without_seconds(alone)
 
 
 def test_divergence_is_named() -> None:

@@ -17,11 +17,11 @@ since the previous line, so that lines dropped on resuming take their seconds wi
 import contextlib
 import dataclasses
 import errno
-import fcntl
 import json
 import math
 import os
 import pathlib
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -30,6 +30,9 @@ import numpy as np
 from envs_mjx.errors import UserError
 from mijax.files import ASIDE, write_atomically
 from mijax.versions import current_versions
+
+if sys.platform != "win32":
+    import fcntl
 
 LOCK = "lock"
 Row = dict[str, Any]
@@ -238,8 +241,11 @@ def plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def _locked(path: pathlib.Path, *, wait: bool) -> Iterator[bool]:
-    """Whether a file could be locked; where files cannot be, always. A file and not a folder, and open for writing:
+    """Whether a file could be locked; where they cannot be, as on Windows, always. A file, and open for writing, as
     NFS shows no other lock to other hosts."""
+    if sys.platform == "win32":
+        yield True
+        return
     with _named_errors(path):
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:

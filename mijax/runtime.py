@@ -1,4 +1,4 @@
-"""What a command sets before JAX starts: host devices, the persistent compilation cache, how XLA compiles."""
+"""What a command sets before JAX starts: host devices and the persistent compilation cache."""
 
 import ctypes
 import gc
@@ -12,11 +12,6 @@ import jax
 from envs_mjx.errors import UserError
 
 CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
-FEW_CORES = 2
-"""On at most so many XLA compiles a program as one module, and not in parts side by side. One CarFlag-2D seed: 1 920
-MiB at its highest, 2 117 with XLA's default; 50.3 and 48.7 s of compiling, one run each on busy cores. The numbers that
-it learns by are the same."""
-SPLIT = "--xla_cpu_parallel_codegen_split_count"
 
 
 def cores() -> int:
@@ -34,18 +29,14 @@ def prepare(host_devices: int = 1) -> None:
         cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mijax" / "jax"
         jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    flags = os.environ.get("XLA_FLAGS", "")
-    if cores() <= FEW_CORES and SPLIT not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {SPLIT}=1".strip()
-    if host_devices > 1 and "host_platform_device_count" not in flags:
+    if host_devices > 1 and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         jax.config.update("jax_num_cpu_devices", host_devices)
 
 
 def release_memory() -> None:
     """Give memory that compiling has left over back to the system, where glibc can.
 
-    A CarFlag-2D learner, compiled in parts, keeps 978 MiB with it and 1 869 without: LLVM's heap is free, but stays
-    with the process.
+    A CarFlag-2D learner keeps 978 MiB with it and 1 869 without: LLVM's heap is free, but stays with the process.
     """
     gc.collect()
     if sys.platform == "linux":

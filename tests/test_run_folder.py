@@ -3,7 +3,6 @@
 import errno
 import io
 import json
-import os
 import sys
 
 import jax.numpy as jnp
@@ -44,16 +43,6 @@ def test_exit_codes(raised: BaseException | None, code: int, said: str, capsys: 
 def test_a_mistake_of_ours_is_not_taken_for_the_user_s():
     with pytest.raises(ZeroDivisionError):
         runtime.exit_code(lambda: 1 / 0)
-
-
-@pytest.mark.parametrize(("cores", "given", "used"), [
-    (2, "--xla_dump_to=there", f"--xla_dump_to=there {runtime.SPLIT}=1"), (64, "", ""),
-    (1, f"{runtime.SPLIT}=8", f"{runtime.SPLIT}=8")])
-def test_few_cores_compile_one_part_at_a_time(cores: int, given: str, used: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("XLA_FLAGS", given)
-    monkeypatch.setattr(runtime, "cores", lambda: cores)
-    runtime.prepare()
-    assert os.environ["XLA_FLAGS"] == used
 
 
 def test_create_and_open(run):

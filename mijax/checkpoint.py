@@ -103,22 +103,20 @@ def open_all(run: RunFolder, seeds: Sequence[int], keep: int = 2) -> dict[int, C
     return {seed: Checkpoints(run, seed, keep) for seed in seeds}
 
 
-def abreast(run: RunFolder, seeds: Sequence[int]) -> list[tuple[int, ...]]:
+def abreast(checkpoints: dict[int, Checkpoints]) -> list[dict[int, Checkpoints]]:
     """Seeds in groups that can go on together, as all of a group have a checkpoint of the same step, or none has any:
     one group, unless a run that several hosts shared is gone on with by fewer, or was killed at its first checkpoint.
     """
-    groups: list[tuple[set[int], list[int]]] = []
-    for seed in seeds:
-        checkpoints = Checkpoints(run, seed)
-        steps = set(checkpoints.steps())
-        checkpoints.close()
+    groups: list[tuple[set[int], dict[int, Checkpoints]]] = []
+    for seed, each in checkpoints.items():
+        steps = set(each.steps())
         for index, (common, members) in enumerate(groups):
             if common & steps or not (common or steps):
-                groups[index] = (common & steps, [*members, seed])
+                groups[index] = (common & steps, members | {seed: each})
                 break
         else:
-            groups.append((steps, [seed]))
-    return [tuple(members) for _, members in groups]
+            groups.append((steps, {seed: each}))
+    return [members for _, members in groups]
 
 
 def exists(run: RunFolder, seeds: Sequence[int]) -> bool:

@@ -237,16 +237,15 @@ def _both_stages(run: RunFolder, env: Environment, training: Training, say: Call
         except UserError:
             run.discard(seeds)  # options that stage 1 cannot do anything with are no run to go on with
             raise
-    for abreast in checkpoint.abreast(run, seeds):
-        runner = SeedRunner(lambda pack: make_learner(env, config, pack), abreast, config.seeds.strategy)
-        checkpoints = checkpoint.open_all(run, abreast, config.checkpoint.keep)
-        _start(runner, run, checkpoints, learnt, say)
-        finished = _loop(runner, run, checkpoints, training, clock, say)
-        for each in checkpoints.values():
-            each.close()
-        if not finished:
+    checkpoints = checkpoint.open_all(run, seeds, config.checkpoint.keep)
+    for abreast in checkpoint.abreast(checkpoints):
+        runner = SeedRunner(lambda pack: make_learner(env, config, pack), tuple(abreast), config.seeds.strategy)
+        _start(runner, run, abreast, learnt, say)
+        if not _loop(runner, run, abreast, training, clock, say):
             break
         _conclude(runner, run, env, say)
+    for each in checkpoints.values():
+        each.close()
 
 
 def _start(

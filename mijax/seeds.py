@@ -63,6 +63,23 @@ class SeedRunner:
         self._chunk = jax.jit(jax.vmap(chunk, (0, None, None)) if self.strategy == "vmap" else chunk, donate_argnums=0)
         self._states: dict[int, LearnerState] = {}  # by seed; under vmap one state of all, stored by the first seed
 
+    def compile(self, template: LearnerState) -> None:
+        """Compile the learning program for the devices in use. Without it the first chunk does so, when compiling and a
+        full-sized replay need memory at once.
+
+        Args:
+            template: shapes of one seed's state.
+        """
+        several = (len(self.seeds),) if self.strategy == "vmap" else ()
+
+        def work(device: jax.Device) -> None:
+            sharding = jax.sharding.SingleDeviceSharding(device)
+            state = jax.tree.map(lambda x: x.update(shape=several + x.shape, sharding=sharding), template)
+            with jax.default_device(device):
+                self._chunk.lower(state, jnp.int32(1), jnp.bool_(True)).compile()
+
+        list(self._pool.map(work, dict.fromkeys(self._device.values())))
+
     def init(self, representations: dict[int, Representation] | None) -> None:
         """Start every seed from scratch, each with its own representation."""
         rep = {seed: None if representations is None else representations[seed] for seed in self.seeds}

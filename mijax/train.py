@@ -240,6 +240,7 @@ def _both_stages(run: RunFolder, env: Environment, training: Training, say: Call
     checkpoints = checkpoint.open_all(run, seeds, config.checkpoint.keep)
     for abreast in checkpoint.abreast(checkpoints):
         runner = SeedRunner(lambda pack: make_learner(env, config, pack), tuple(abreast), config.seeds.strategy)
+        clock.lap()  # what stage 1 compiled is in its own seconds
         _start(runner, run, abreast, learnt, say)
         if not _loop(runner, run, abreast, training, clock, say):
             break
@@ -253,9 +254,14 @@ def _start(
     say: Callable[[str], None],
 ) -> None:
     """From the newest checkpoint, or from scratch; metrics after it are dropped and will be written again."""
-    if all(each.steps() for each in checkpoints.values()):
-        representation = None if learnt is None else learnt[runner.seeds[0]]
-        template = jax.eval_shape(runner.learner.init, training_key(0), representation)
+    resumes = all(each.steps() for each in checkpoints.values())
+    if not resumes:
+        say(f"stage 2: compiling, then {_prelude(runner.learner)}")
+    template = jax.eval_shape(
+        runner.learner.init, training_key(0), None if learnt is None else learnt[runner.seeds[0]])
+    runner.compile(template)
+    runtime.release_memory()
+    if resumes:
         step, states = checkpoint.load_latest(checkpoints, template, say)
         runner.restore(states)
         run.truncate_after(step, runner.seeds)
@@ -264,7 +270,6 @@ def _start(
         say(f"going on from step {step:,}")
     else:
         run.truncate_after(-1, runner.seeds)
-        say(f"stage 2: compiling, then {_prelude(runner.learner)}")
         runner.init(learnt)
         shown = all(runner.learner.has_demonstrations(state) for state in runner.states().values())
         require(shown, "sac.demonstrations", runner.learner.demonstrations,
@@ -324,7 +329,7 @@ def _loop(
 
 def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[int, dict[str, float]]:
     """One chunk and its evaluation: a row of metrics by seed. Wall seconds are those of all seeds together, shared."""
-    clock.lap()
+    compiled_before = clock.lap()  # by `_start`, before the first chunk
     started = time.perf_counter()
     metrics = runner.advance()
     compiled = clock.lap()
@@ -335,7 +340,7 @@ def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[in
     if compiled + compiled_evaluation > 0:
         runtime.release_memory()
     share = 1 / len(runner.seeds)
-    wall = {"compile": compiled + compiled_evaluation, "training": trained - started - compiled,
+    wall = {"compile": compiled_before + compiled + compiled_evaluation, "training": trained - started - compiled,
             "evaluation": ended - trained - compiled_evaluation}
     wall = {f"wall/{part}": max(seconds, 0) * share for part, seconds in wall.items()}
     iterations = (runner.step - runner.learner.warmup_steps) // config.iteration_steps

@@ -13,7 +13,7 @@ from tokens import FEATURES, TINY, representation
 from envs_mjx import registry
 from mijax.config import Config, DQNConfig, EvaluationConfig, SeedStrategy, Stage1Config
 from mijax.learner import LearnerState, make_learner
-from mijax.seeds import SeedRunner, resolve
+from mijax.seeds import SeedRunner, resolve, training_key
 
 pytestmark = pytest.mark.lenient
 
@@ -50,15 +50,32 @@ def equal(x: Any, y: Any) -> bool:
     return all(jax.tree.leaves(jax.tree.map(np.array_equal, x, y)))
 
 
+def note_compiled(names: list[str], event: str, duration_secs: float, **kwargs: str | int) -> None:
+    """Listens to what JAX compiles, or takes from its cache."""
+    del duration_secs
+    if event.endswith("backend_compile_duration"):
+        names.append(str(kwargs.get("fun_name")))
+
+
 class Followed:
     """All seeds under a strategy: their metrics over two chunks, their states at the start and between them."""
 
     def __init__(self, strategy: SeedStrategy) -> None:
-        self.runner = started(SEEDS, strategy)
+        compiled: list[str] = []
+        listener = functools.partial(note_compiled, compiled)
+        jax.monitoring.register_event_duration_secs_listener(listener)
+        env = registry.make("heaven_hell")
+        self.runner = fresh(SEEDS, strategy)
+        self.runner.compile(jax.eval_shape(
+            self.runner.learner.init, training_key(0), representation(env, 0)))
+        self.compiled_at_first = compiled.copy()
+        self.runner.init({seed: representation(env, seed) for seed in SEEDS})
         self.start = copied(self.runner.states())
         self.first = self.runner.advance()
         self.step, self.states = self.runner.step, copied(self.runner.states())
         self.second = self.runner.advance()
+        self.compiled = compiled.copy()
+        jax.monitoring.unregister_event_duration_listener(listener)
 
     def go_on_from(self, states: States) -> SeedRunner:
         """The runner, at other states."""
@@ -129,6 +146,16 @@ def test_an_agent_without_a_representation_warms_up_alike(follow: Callable[[Seed
         expected = follow("map").start[seed].replay
         assert state.representation is None
         assert equal(state.replay, dataclasses.replace(expected, data=dataclasses.replace(expected.data, z_s=None)))
+
+
+@pytest.mark.parametrize("strategy", ["map", "shard", "vmap"])
+def test_learning_is_compiled_once_before_there_is_a_state(
+    follow: Callable[[SeedStrategy], Followed], strategy: SeedStrategy,
+) -> None:
+    followed = follow(strategy)
+    learning = [name for name in followed.compiled if "chunk" in name]
+    assert learning
+    assert [name for name in followed.compiled_at_first if "chunk" in name] == learning
 
 
 def test_auto() -> None:

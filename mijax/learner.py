@@ -215,10 +215,11 @@ class Learner:
         metrics = jax.tree.map(lambda x: x / iterations, losses) | totals.metrics()
         return state, metrics | {"train/epsilon": self.epsilon(self.environment_steps(state))}
 
-    def collect_chunk(self, state: LearnerState) -> EpisodeTotals:
-        """The environment steps of one chunk without its updates: what acting and stepping alone cost."""
+    def collect_chunk(self, state: LearnerState) -> tuple[EpisodeTotals, Replay]:
+        """The environment steps of one chunk without its updates: what acting, stepping and storing cost."""
         keys = jax.random.split(state.key, self.iterations_per_chunk * self.config.steps_per_iteration)
-        return self._collect(state, self.epsilon(self.environment_steps(state)), keys)[1]
+        state, totals = self._collect(state, self.epsilon(self.environment_steps(state)), keys)
+        return totals, state.replay
 
     def evaluate(self, state: LearnerState, key: jax.Array, num_episodes: int, actor: Actor | None = None) -> Metrics:
         """Greedy episodes of the averaged network: per-episode results, each (num_episodes,); `actor`: played by

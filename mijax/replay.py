@@ -120,7 +120,7 @@ def returns_of(replay: Replay, slots: jax.Array) -> jax.Array:
 
 def sample_episodes(replay: Replay, key: jax.Array, batch: int, share: float = 0.0) -> jax.Array:
     """(batch,) int32 slots of finished episodes, uniform with replacement whatever their length; with a `share`, each
-    is uniform over the kept ones with that probability.
+    is uniform over the kept ones of its fold with that probability.
 
     The first half of the batch comes from episodes at even places of the ring and the second half from those at odd
     ones, for as long as an episode lives: two folds, so that a model fitted on one can be tried on the other.
@@ -134,5 +134,6 @@ def sample_episodes(replay: Replay, key: jax.Array, batch: int, share: float = 0
     place = uniform(key, number)
     if share > 0 and replay.kept:
         key_which, key_kept = jax.random.split(jax.random.fold_in(key, 1))
-        place = jnp.where(jax.random.bernoulli(key_which, share, (batch,)), uniform(key_kept, replay.kept), place)
+        kept = jnp.minimum(uniform(key_kept, replay.kept), replay.kept - 1)  # one alone is in both folds
+        place = jnp.where(jax.random.bernoulli(key_which, share, (batch,)), kept, place)
     return replay.finished[jnp.minimum(place, number - 1)]

@@ -123,7 +123,8 @@ def collect_step(
     )
     env_state, timestep = jax.vmap(env.step)(jax.random.split(key_env, num_envs), episodes.env_state, action)
     position, returns = episodes.position + 1, episodes.returns + timestep.reward
-    replay = write(replay, record(timestep, action, env_state, episodes.symmetry), position)
+    reached = record(timestep, action, env_state, episodes.symmetry)
+    replay = write(replay, reached, position)
     done = timestep.done
     totals = EpisodeTotals(
         totals.episodes + jnp.sum(done, dtype=jnp.int32),
@@ -133,8 +134,13 @@ def collect_step(
     )
     replay = finish(replay, done, position + 1)
     running = Episodes(env_state, timestep, memory, action, position, returns, episodes.symmetry)
-    episodes = select(done, start_episodes(env, agent, num_envs, key_reset, agent.copies > 0), running)
-    first = record(episodes.timestep, episodes.previous_action, episodes.env_state, episodes.symmetry)
+
+    def begin() -> tuple[Episodes, StepRecord]:
+        begun = select(done, start_episodes(env, agent, num_envs, key_reset, agent.copies > 0), running)
+        return begun, record(begun.timestep, begun.previous_action, begun.env_state, begun.symmetry)
+
+    # What a robot's replay stores costs as much as a step, and few steps end an episode.
+    episodes, first = jax.lax.cond(jnp.any(done), begin, lambda: (running, reached))
     return episodes, write(replay, first, episodes.position, keep=done), totals
 
 

@@ -182,6 +182,11 @@ class RunFolder:
             if self._metrics_file(seed).exists():
                 _write(self._metrics_file(seed), "".join(f"{line}\n" for line in kept))
 
+    def has_results(self, seed: int) -> bool:
+        """Whether it was trained to its end, or its metrics are published."""
+        ended = (self._file("summary.json"), self.seed_path(seed) / "end.json")
+        return any(path.exists() for path in (*ended, self._published(seed)))
+
     def write_end(self, seed: int, step: int, end: Mapping[str, Any]) -> None:
         """Write what a seed came to at its last step, for the summary of all."""
         _write_json(self.seed_path(seed) / "end.json", {"step": step, **end})
@@ -220,8 +225,11 @@ class RunFolder:
     def _file(self, name: str) -> pathlib.Path:
         return self.path / name
 
+    def _published(self, seed: int) -> pathlib.Path:
+        return self._file(f"metrics_seed_{seed}.jsonl")
+
     def _metrics_file(self, seed: int) -> pathlib.Path:
-        published = self._file(f"metrics_seed_{seed}.jsonl")
+        published = self._published(seed)
         return published if published.exists() else self.seed_path(seed) / "metrics.jsonl"
 
 

@@ -6,17 +6,22 @@ import os
 import pathlib
 import sys
 from collections.abc import Callable
+from typing import NoReturn
 
 import jax
 
 from envs_mjx.errors import UserError
 
 CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+INTERRUPTED = 130
+"""What a command returns after Ctrl-C."""
 
 
 def cores() -> int:
-    """CPU cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """CPU cores this process may use: at most the variable NPROC, which XLA keeps to as well."""
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get("NPROC", "")
+    return min(available, int(limit)) if limit.isdecimal() and int(limit) > 0 else available
 
 
 def prepare(host_devices: int = 1) -> None:
@@ -45,6 +50,16 @@ def release_memory() -> None:
             trim(0)
 
 
+def leave(code: int) -> NoReturn:
+    """End the process with this code: at once after Ctrl-C, when a thread may be in a long computation, which the
+    interpreter would wait for."""
+    if code == INTERRUPTED:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
 def exit_code(work: Callable[[], object], *others: type[Exception]) -> int:
     """0 once a command's work is done; 1 after one line on what the user can mend (`UserError`, an error of the file
     system, `others`); 130 after Ctrl-C, whose exception may say how to go on."""
@@ -52,7 +67,7 @@ def exit_code(work: Callable[[], object], *others: type[Exception]) -> int:
         work()
     except KeyboardInterrupt as stopped:
         print(str(stopped) or "stopped", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except (UserError, OSError, *others) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

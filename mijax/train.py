@@ -157,7 +157,7 @@ class CompileClock:
 
     def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         del kwargs
-        if event.endswith(("backend_compile_duration", "compilation_cache/cache_retrieval_time_sec")):
+        if event.endswith("backend_compile_duration"):  # what the cache has is in it as well
             with self._lock:
                 self._total += duration_secs
 
@@ -217,6 +217,10 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     training = Training(config, host.share(every_seed), options.track)
     run = open_run(options, host, fill)
     with run.held(training.seeds):
+        lost = [seed for seed in training.seeds if run.has_results(seed) and not checkpoint.exists(run, [seed])]
+        if lost:
+            raise TrainingError(f"{run.path}: seed {lost[0]} has results, but no checkpoint to go on from, and "
+                                "training it again would replace them; choose another --out")
         if options.resume is not None and host.index == 0:
             run.amend(steps=config.steps, track=training.track)
         title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))
@@ -241,8 +245,11 @@ def _both_stages(run: RunFolder, env: Environment, training: Training, say: Call
     for abreast in checkpoint.abreast(checkpoints):
         runner = SeedRunner(lambda pack: make_learner(env, config, pack), tuple(abreast), config.seeds.strategy)
         clock.lap()  # what stage 1 compiled is in its own seconds
+        started = time.perf_counter()
         _start(runner, run, abreast, learnt, say)
-        if not _loop(runner, run, abreast, training, clock, say):
+        compiled = clock.lap()
+        before = {"start": time.perf_counter() - started - compiled, "compile": compiled}
+        if not _loop(runner, run, abreast, training, clock, before, say):
             break
         _conclude(runner, run, env, say)
     for each in checkpoints.values():
@@ -295,9 +302,12 @@ def _prelude(learner: Learner) -> str:
 
 def _loop(
     runner: SeedRunner, run: RunFolder, checkpoints: dict[int, checkpoint.Checkpoints], training: Training,
-    clock: CompileClock, say: Callable[[str], None],
+    clock: CompileClock, before: Mapping[str, float], say: Callable[[str], None],
 ) -> bool:
-    """Chunks, evaluations, metrics and checkpoints up to the run's steps; False when asked to stop before."""
+    """Chunks, evaluations, metrics and checkpoints up to the run's steps; False when asked to stop before.
+
+    `before`: seconds by part, of what went before; they belong to the first row.
+    """
     config = training.config
     tracker, stop = make_tracker(training.track, run), StopRequest(say)
     agent, evaluations = runner.learner.agent, 0
@@ -309,7 +319,7 @@ def _loop(
     try:
         with ProgressDisplay("stage 2", runner.last_step, start=runner.step) as progress:
             while runner.step < config.steps and not stop.asked:
-                rows = _advance(runner, config, clock)
+                rows = _advance(runner, config, clock, {} if evaluations else before)
                 for seed, row in rows.items():
                     _refuse_divergence(seed, row, agent.group, agent.options.learning_rate)
                     run.append(seed, row)
@@ -327,9 +337,11 @@ def _loop(
     return runner.step >= config.steps
 
 
-def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[int, dict[str, float]]:
+def _advance(
+    runner: SeedRunner, config: Config, clock: CompileClock, before: Mapping[str, float]
+) -> dict[int, dict[str, float]]:
     """One chunk and its evaluation: a row of metrics by seed. Wall seconds are those of all seeds together, shared."""
-    compiled_before = clock.lap()  # by `_start`, before the first chunk
+    clock.lap()
     started = time.perf_counter()
     metrics = runner.advance()
     compiled = clock.lap()
@@ -340,9 +352,9 @@ def _advance(runner: SeedRunner, config: Config, clock: CompileClock) -> dict[in
     if compiled + compiled_evaluation > 0:
         runtime.release_memory()
     share = 1 / len(runner.seeds)
-    wall = {"compile": compiled_before + compiled + compiled_evaluation, "training": trained - started - compiled,
+    wall = {"compile": compiled + compiled_evaluation, "training": trained - started - compiled,
             "evaluation": ended - trained - compiled_evaluation}
-    wall = {f"wall/{part}": max(seconds, 0) * share for part, seconds in wall.items()}
+    wall = {f"wall/{part}": max(wall.get(part, 0) + before.get(part, 0), 0) * share for part in {**before, **wall}}
     iterations = (runner.step - runner.learner.warmup_steps) // config.iteration_steps
     update = iterations * runner.learner.updates_per_iteration
     return {
@@ -356,8 +368,8 @@ def _refuse_divergence(seed: int, row: Mapping[str, float], group: str, learning
     bad = [name for name, value in row.items() if name.startswith("loss/") and not np.isfinite(value)]
     if bad:
         raise TrainingError(
-            f"seed {seed}: {bad[0]} is {row[bad[0]]} at step {row['step']:,}; go on from the last checkpoint "
-            f"or try a smaller --{group}.learning-rate than {learning_rate}")
+            f"seed {seed}: {bad[0]} is {row[bad[0]]} at step {row['step']:,}, and would be again on resuming; train "
+            f"anew in another --out, with a smaller --{group}.learning-rate than {learning_rate}")
 
 
 def _overview(rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:
@@ -397,17 +409,31 @@ def _conclude(runner: SeedRunner, run: RunFolder, env: Environment, say: Callabl
         say(report.write_report(load([run.path]), run.path))
 
 
+def _prepare(seeds: str, strategy: str) -> None:
+    """A device of the CPU for every seed that can have a core of its own."""
+    count = len(parse_seeds(seeds))
+    shard = strategy == "shard" or (strategy == "auto" and count > 1)
+    runtime.prepare(host_devices=min(runtime.cores(), count) if shard else 1)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
+    given = sys.argv[1:] if arguments is None else arguments
+
     def work() -> None:
-        options = parse(sys.argv[1:] if arguments is None else arguments)
-        seeds, strategy = parse_seeds(options.seeds), options.config.seeds.strategy
-        shard = strategy == "shard" or (strategy == "auto" and len(seeds) > 1)
-        runtime.prepare(host_devices=min(runtime.cores(), len(seeds)) if shard else 1)
+        first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        for name, default in (("--seeds", "1"), ("--seeds.strategy", "auto"), ("--resume", None)):
+            first.add_argument(name, default=default, dest=name)
+        known = vars(first.parse_known_args(list(given))[0])
+        if known["--resume"] is None:  # before `parse`, which may make an environment, and that may start JAX
+            _prepare(known["--seeds"], known["--seeds.strategy"])
+        options = parse(given)
+        if known["--resume"] is not None:
+            _prepare(options.seeds, options.config.seeds.strategy)
         train(options)
 
     return runtime.exit_code(work)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    runtime.leave(main())

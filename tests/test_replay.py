@@ -118,8 +118,8 @@ def test_sampling_is_uniform_over_episodes_whatever_their_length():
     np.testing.assert_allclose(counts / 10_000, 1 / len(lengths), atol=4 * np.sqrt(0.25 / 10_000))
 
 
-def test_kept_episodes_stay_and_have_their_share():
-    kept = 2
+@pytest.mark.parametrize("kept", [1, 2, 3])
+def test_kept_episodes_stay_and_have_their_share(kept: int):
     replay = init_replay(record_of(np.zeros(NUM_ENVS, int), np.zeros(NUM_ENVS, int), np.ones(NUM_ENVS, int)),
                          kept + NUM_ENVS + 1, HORIZON, kept)
     seen, step = [], jax.jit(finish)

@@ -3,6 +3,7 @@
 import errno
 import io
 import json
+import subprocess
 import sys
 
 import jax.numpy as jnp
@@ -43,6 +44,13 @@ def test_exit_codes(raised: BaseException | None, code: int, said: str, capsys: 
 def test_a_mistake_of_ours_is_not_taken_for_the_user_s():
     with pytest.raises(ZeroDivisionError):
         runtime.exit_code(lambda: 1 / 0)
+
+
+def test_after_an_interrupt_no_thread_is_waited_for():
+    script = "from concurrent.futures import ThreadPoolExecutor; import time; from mijax import runtime; " \
+             "ThreadPoolExecutor().submit(time.sleep, 600); runtime.leave({})"
+    ended = subprocess.run([sys.executable, "-c", script.format(runtime.INTERRUPTED)], timeout=120)
+    assert ended.returncode == runtime.INTERRUPTED
 
 
 def test_create_and_open(run):

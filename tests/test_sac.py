@@ -575,7 +575,7 @@ def test_acting_sees_no_state():
     greedy, other = (run.evaluate(state, jax.random.key(3), 16)["return"] for run in runs)
     np.testing.assert_allclose(other, greedy, rtol=1e-5)
     assert np.std(greedy) > 0.1  # it does act on what it sees
-    exploring, other = (jax.jit(run.learner.collect_chunk)(state) for run in runs)
+    exploring, other = (jax.jit(run.learner.collect_chunk)(state)[0] for run in runs)
     assert int(exploring.episodes) == int(other.episodes) > 0
     np.testing.assert_allclose(other.returns, exploring.returns, rtol=1e-5)
 

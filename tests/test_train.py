@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 import pytest
+from tiny_runs import TINY, comparable
 
 from mijax import train
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds
@@ -21,22 +22,8 @@ from mijax.run_folder import RunError, RunFolder
 
 pytestmark = pytest.mark.lenient
 
-TINY = [
-    "--network.action-embedding", "4", "--network.observation-embedding", "4", "--network.critic-hidden", "8",
-    "--network.auxiliary-hidden", "8", "--stage1.episodes", "12", "--stage1.heldout-episodes", "8",
-    "--stage1.epochs", "2", "--stage1.batch-size", "100", "--dqn.batch-episodes", "4", "--dqn.replay-steps", "2000",
-    "--dqn.warmup-episodes", "4", "--evaluation.every", "200", "--evaluation.episodes", "4", "--checkpoint.every", "1",
-]
-
-
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "mijax.train", *arguments]
-
-
-def comparable(run: pathlib.Path, seed: int) -> list[dict]:
-    """A seed's metrics without the seconds."""
-    rows = RunFolder.open(run).metrics(seed)
-    return [{name: value for name, value in row.items() if not name.startswith("wall/")} for row in rows]
 
 
 def without_seconds(seeds: dict[str, dict]) -> dict[str, dict]:
@@ -285,6 +272,27 @@ def test_seeds_that_are_not_abreast_go_on_one_after_the_other(
     assert comparable(path, 3) == comparable(whole_run, 3)
     there, alone = (json.loads((run / "summary.json").read_text())["seeds"] for run in (path, whole_run))
     assert without_seconds(there) == without_seconds(alone)
+
+
+def test_results_without_a_checkpoint_are_not_replaced(
+    whole_run: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "kept_small"
+    shutil.copytree(whole_run, path)
+    shutil.rmtree(path / "seed_3" / "checkpoints")
+    shutil.rmtree(path / "seed_3" / "representation")
+    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    assert train.main(["--resume", str(path), "--steps", "1600"]) == 1
+    assert "seed 3 has results, but no checkpoint to go on from" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+
+
+def test_devices_are_set_before_an_environment_starts_jax() -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    arguments = ("--domain", "examples.gymnax_memory:MemoryChain", "--preset", "paper", "--seeds", "2", "--steps", "1")
+    ended = subprocess.run(command(*arguments), capture_output=True, text=True, env=environment)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("error: --steps: got 1, accepted: more than the")
 
 
 def test_divergence_is_named() -> None:

@@ -17,6 +17,8 @@ def make_agent(env: Environment, config: Config) -> Agent:
     width = net.action_embedding + net.observation_embedding
     require(memory_of(config) != "gpt" or width % net.heads == 0, "network.heads", net.heads,
             f"a divisor of the transformer's width {width} (action-embedding + observation-embedding)")
+    require(config.agent != "believer" or len(net.auxiliary_hidden) > 0, "network.auxiliary-hidden", "none",
+            "at least one width, as Believer embeds its beliefs with the last one")
     agent = make_dqn(env, config) if isinstance(env.action_spec, DiscreteActions) else make_sac(env, config)
     config.updates_per_iteration(agent.group, agent.options.updates_per_step)
     require(agent.copies == 0 or shows_again(env), "sac.rotated-copies", agent.copies,

@@ -33,7 +33,6 @@ with the same SPEC, it goes on with what is not done:
 import argparse
 import dataclasses
 import itertools
-import os
 import pathlib
 import signal
 import subprocess
@@ -41,8 +40,8 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 import yaml
 from rich.console import Console
@@ -50,51 +49,15 @@ from rich.live import Live
 from rich.table import Table
 
 from envs_mjx.errors import UserError
-from launch.job import available_cores
+from launch.job import STOP, Job, State, available_cores, run_job
 from mijax import train
 from mijax.config import ConfigError, parse_seeds, require
 from mijax.run_folder import RunError, RunFolder
 
-State = Literal["waiting", "submitted", "running", "done", "failed", "stopped"]
 KEYS = ("options", "grid", "seeds", "seeds_per_job", "resources", "retries")
 RESOURCES = ("cpus", "gpus")
 SET_BY_SWEEP = ("seeds", "out", "resume", "hosts")
 REFRESH_SECONDS = 2.0
-STOP = signal.SIGTERM
-"""Asks a run to save and end. Ctrl-C's signal would be ignored by what a shell has started in the background."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """One run of `mijax.train`."""
-
-    name: str
-    """Of its folder: what tells it from the sweep's other jobs."""
-    arguments: tuple[str, ...]
-    """Of a new run, without its folder."""
-    out: pathlib.Path
-    """Of the sweep."""
-
-    @property
-    def path(self) -> pathlib.Path:
-        """The run folder."""
-        return self.out / self.name
-
-    @property
-    def log(self) -> pathlib.Path:
-        """What the run prints."""
-        return self.out / f"{self.name}.log"
-
-    @property
-    def done(self) -> bool:
-        """Whether the run has ended well."""
-        return (self.path / "summary.json").exists()
-
-    def command(self, cores: Sequence[int]) -> list[str]:
-        """Starts the run, or goes on with it."""
-        begun = (self.path / "config.json").exists()
-        arguments = ("--resume", str(self.path)) if begun else (*self.arguments, "--out", str(self.path))
-        return [sys.executable, "-m", "launch.job", ",".join(map(str, cores)), str(os.getpid()), *arguments]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,42 +147,6 @@ def check(job: Job) -> None:
 # ----------------------------------------------------------------------------------------------------------------- job
 
 
-def run_job(
-    job: Job, retries: int, cores: Sequence[int] = (), started: Callable[[subprocess.Popen], None] | None = None
-) -> State:
-    """Run a job to its end, again after each death of its process, in a process that cannot outlive this one.
-
-    A process that ends by itself with an error is not started again: it would end so again. Ctrl-C asks it to save.
-
-    Args:
-        job: what to run.
-        retries: how often a job that was killed goes on from its last checkpoint.
-        cores: to run on; none: any.
-        started: called with every process that was started.
-    """
-    job.log.parent.mkdir(parents=True, exist_ok=True)
-    for _ in range(retries + 1):
-        if job.done:
-            return "done"
-        with job.log.open("a", encoding="utf-8") as log:
-            process = subprocess.Popen(job.command(cores), stdout=log, stderr=subprocess.STDOUT,
-                                       stdin=subprocess.DEVNULL, start_new_session=True)
-        if started is not None:
-            started(process)
-        try:
-            code = process.wait()
-        except KeyboardInterrupt:
-            process.send_signal(STOP)
-            code = process.wait()
-        if job.done:
-            return "done"
-        if code in (0, -STOP):
-            return "stopped"
-        if code > 0:
-            return "failed"
-    return "failed"
-
-
 def progress(job: Job) -> tuple[int, dict[str, float]]:
     """Environment steps so far, of the seed that is furthest behind, and means of what its seeds last measured."""
     try:
@@ -307,7 +234,9 @@ class OnRay:
         # twice, so that every job starts from a clean process.
         place = ray.remote(num_cpus=sweep.cpus, num_gpus=sweep.gpus, max_retries=sweep.retries, max_calls=1)(run_job)
         self._states: dict[str, State] = {job.name: "done" if job.done else "submitted" for job in sweep.jobs}
-        self._pending = {place.remote(job, sweep.retries): job for job in sweep.jobs if not job.done}
+        # Ray tells no job which cores are its own: jobs keep to a number of threads, and the system places these.
+        self._pending = {place.remote(job, sweep.retries, threads=sweep.cpus): job
+                         for job in sweep.jobs if not job.done}
 
     @property
     def states(self) -> Mapping[str, State]:

@@ -166,6 +166,8 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
     run = RunFolder.open(options.run)
     config, seeds = training_of(run).config, seeds_of(run, options.seeds)
     learner = make_learner(registry.make(config.domain), config)
+    if options.text or (options.gif and not evaluate_robot.is_robot(learner.domain)):
+        draw.drawable(learner.domain)  # said before the episodes are played
     actor = Forgetful(learner.agent, options.remember) if options.remember else learner.agent
     rows, steps = {}, {}
     for seed in seeds:

@@ -49,11 +49,11 @@ def open_run(options: RepresentOptions, seeds: Sequence[int]) -> RunFolder:
     """A new run folder, or the one that the same command made before it was stopped."""
     path = options.out or pathlib.Path("runs") / f"{registry.file_name(options.domain)}-representation"
     stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
-    if (path / "config.json").exists() and not options.search:
+    if (path / "config.json").exists():
         run = RunFolder.open(path)
-        if run.config() == stored:
+        if run.config() == stored and not options.search:
             return run
-        raise RunError(f"{path}: was made with other options; choose another --out")
+        raise RunError(f"{path}: was made with other options, or by a search; choose another --out")
     return RunFolder.create(path, stored)
 
 

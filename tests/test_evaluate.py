@@ -12,6 +12,7 @@ from commands import failure_of
 from PIL import Image
 
 from envs_mjx import registry
+from envs_mjx.grid import draw
 from envs_mjx.grid.optimal import optimum
 from mijax import evaluate
 from mijax.agents.forgetful import Forgetful
@@ -89,6 +90,13 @@ def test_a_cut_memory_is_an_episode_that_began_later():
             memory, expected = act(params, memory, seen[earlier], before[earlier])
         np.testing.assert_array_equal(action, expected)
     assert np.abs(told(0, 4) - told(2, 4)).max() > 1e-3
+
+
+def test_what_cannot_be_drawn_is_said_before_anything_is_played(
+    run: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(draw, "GridWorld", ())
+    assert "'heaven_hell' cannot be drawn" in failure_of(evaluate.main, capsys, str(run), "--gif")
 
 
 def test_an_episode_is_drawn_and_printed(run: pathlib.Path, capsys: pytest.CaptureFixture[str]):

@@ -367,6 +367,8 @@ def test_the_command_learns_probes_and_keeps(tmp_path, capsys):
     assert (folder / "representation.msgpack").stat().st_mtime_ns == made
     assert represent.main(["--domain", "heaven_hell", *options, "--stage1.lambda-r", "2"]) == 1
     assert "was made with other options" in capsys.readouterr().err
+    assert represent.main(["--domain", "heaven_hell", *options, "--search", "2"]) == 1
+    assert "choose another --out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("options", [["--domain", "nowhere"], ["--seeds", "x"], ["--seeds", "0"]])

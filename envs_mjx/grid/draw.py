@@ -58,6 +58,18 @@ def text(env: Environment, env_state: GridState) -> str:
     return "\n".join([*(" ".join(line) for line in kinds), _caption(world, env_state)])
 
 
+def drawable(env: Environment) -> GridWorld:
+    """The environment, if it can be drawn.
+
+    Raises:
+        NoDrawing: it is no grid world.
+    """
+    if not isinstance(env, GridWorld):
+        raise NoDrawing(f"environment {env.name!r} cannot be drawn, as grid worlds (envs_mjx.grid.world) and robot "
+                        "tasks can; for any other: python -m mijax.report RUN --episode")
+    return env
+
+
 def letters(env: Environment, env_state: GridState) -> list[str]:
     """The world alone, a string per row: G goal, ? information, x hell, o wrong corner, # wall, . free."""
     return ["".join(line) for line in _layout(env, env_state)[1]]
@@ -81,17 +93,15 @@ def _draw_cells(draw: ImageDraw.ImageDraw, kinds: list[list[str]]) -> None:
 
 def _layout(env: Environment, env_state: GridState) -> tuple[GridWorld, list[list[str]]]:
     """The world, and a letter of `_COLOURS` for each of its cells."""
-    if not isinstance(env, GridWorld):
-        raise NoDrawing(f"environment {env.name!r} cannot be drawn, as grid worlds (envs_mjx.grid.world) and robot "
-                        "tasks can; for any other: python -m mijax.report RUN --episode")
-    tables, goal = env.tables, int(env_state.goal)
+    world = drawable(env)
+    tables, goal = world.tables, int(env_state.goal)
     kinds = np.full(tables.walls.size, ".")
     kinds[tables.walls.reshape(-1)] = "#"
     kinds[tables.informs] = "?"
     kinds[tables.terminal[:, goal]] = "o"
     kinds[tables.terminal[:, goal] & (tables.rewards[:, goal] < 0)] = "x"
     kinds[tables.goals[goal]] = "G"
-    return env, kinds.reshape(tables.shape).tolist()
+    return world, kinds.reshape(tables.shape).tolist()
 
 
 def _caption(world: GridWorld, env_state: GridState) -> str:

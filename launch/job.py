@@ -4,7 +4,7 @@
 
 CORES are numbers with commas between them, or nothing for all; PARENT is the starter's process id.
 
-What starts a job imports no JAX: on Ray, where every job has a starter of its own, that took a tenth of a short sweep.
+What starts a job imports no JAX: on Ray, where every job has a starter of its own, that took 8 % of a short sweep.
 """
 
 import ctypes

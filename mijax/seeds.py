@@ -148,7 +148,10 @@ class SeedRunner:
         seed."""
         def stored(state: LearnerState) -> Any:
             # All of the replay is looked at, or XLA would leave its writing out.
-            return jax.tree.map(jnp.sum, self.learner.collect_chunk(state))
+            return jax.tree.map(total, self.learner.collect_chunk(state))
+
+        def total(x: jax.Array) -> jax.Array:
+            return jnp.sum(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
 
         seed = self.seeds[0]
         program = jax.jit(self._mapped(stored))

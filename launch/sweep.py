@@ -144,7 +144,7 @@ def check(job: Job) -> None:
         raise ConfigError(f"spec: {job.name}: options {' '.join(job.arguments)} are not accepted, see above") from None
 
 
-# ----------------------------------------------------------------------------------------------------------------- job
+# -------------------------------------------------------------------------------------------------------------- jobs
 
 
 def progress(job: Job) -> tuple[int, dict[str, float]]:

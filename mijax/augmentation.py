@@ -44,53 +44,31 @@ def show_copy(
     return env.show(env_state), jax.tree.unflatten(jax.tree.structure(actions), leaves)
 
 
-def draw_copies(tokens: Tokens, copies: int, batch: int, key: jax.Array) -> jax.Array:
-    """(R, L) int32: which copy of its episode each token shows, the same in all of an episode's, drawn uniformly."""
-    drawn = jax.random.randint(key, (batch,), 0, copies + 1, jnp.int32)
-    return drawn[jnp.maximum(tokens.segment - 1, 0)]
+def draw_copies(copies: int, batch: int, key: jax.Array) -> jax.Array:
+    """(batch,) int32: which copy of each episode is sampled, 0 the episode as it was, uniform."""
+    return jax.random.randint(key, (batch,), 0, copies + 1, jnp.int32)
 
 
-def take_copies(tokens: Tokens, copies: int, batch: int, key: jax.Array) -> Tokens:
-    """Tokens of `batch` episodes, each in one of its copies, of a replay that stores what every copy shows.
-
-    Args:
-        tokens: their frames and states are features (R L, 1 + copies, D), actions and z_s (R, L, 1 + copies, ...).
-        copies: besides the original.
-    """
-    copy = draw_copies(tokens, copies, batch, key)
-    frames = _take(jnp.asarray(tokens.frames), copy.reshape(-1))
-    states = None if tokens.states is None else _take(tokens.states, copy.reshape(-1))
-    z_s = None if tokens.z_s is None else _take(tokens.z_s, copy)
-    return dataclasses.replace(
-        tokens, frames=frames, states=states, previous_action=_take(tokens.previous_action, copy), z_s=z_s,
-        intended=None if tokens.intended is None else _take(tokens.intended, copy))
-
-
-def _take(x: jax.Array, copy: jax.Array) -> jax.Array:
-    """(*B, 1 + copies, D) -> (*B, D) in the copies (*B,)."""
-    return jnp.take_along_axis(x, copy[..., None, None], axis=-2)[..., 0, :]
-
-
-def show_tokens(env: Environment, tokens: Tokens, copies: int, batch: int, key: jax.Array, states: bool) -> Tokens:
-    """Tokens of `batch` episodes with frames in place of moments; each episode in one of its copies, drawn uniformly.
+def show_tokens(env: Environment, tokens: Tokens, copy: jax.Array | None, states: bool) -> Tokens:
+    """Tokens with frames in place of moments.
 
     Args:
-        tokens: their frames are moments, leaves (R L, ...); with `copies`, their z_s are (R, L, 1 + copies, F).
-        copies: besides the original.
+        tokens: their frames are moments, leaves (R L, ...); with copies, their z_s are (R, L, 1 + copies, F).
+        copy: (B,) int32, which copy is shown of the episode of each segment; None where there are none.
         states: whether the states are wanted too.
     """
     actions, z_s = (tokens.previous_action, tokens.intended), tokens.z_s
-    if copies == 0:
+    if copy is None:
         timestep = jax.vmap(env.show)(tokens.frames)
     else:
-        copy = draw_copies(tokens, copies, batch, key)
+        here = copy[jnp.maximum(tokens.segment - 1, 0)]
         symmetry = cast(jax.Array, tokens.symmetry).reshape(-1, 2)
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), actions)
         timestep, moved = jax.vmap(lambda *moment: show_copy(env, *moment))(
-            symmetry, copy.reshape(-1), tokens.frames, flat)
+            symmetry, here.reshape(-1), tokens.frames, flat)
         actions = jax.tree.map(lambda x, like: x.reshape(like.shape), moved, actions)
         if z_s is not None:
-            z_s = _take(z_s, copy)
+            z_s = jnp.take_along_axis(z_s, here[..., None, None], axis=-2)[..., 0, :]
     return dataclasses.replace(
         tokens, frames=timestep.observation, previous_action=actions[0], intended=actions[1], z_s=z_s,
         states=timestep.state if states else None, symmetry=None)

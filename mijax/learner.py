@@ -20,7 +20,7 @@ from mijax.agents.core import Agent, AgentState
 from mijax.agents.factory import make_agent
 from mijax.agents.state_shown import StateShown
 from mijax.agents.variants import variant
-from mijax.augmentation import show_copy, show_tokens, shows_again, take_copies
+from mijax.augmentation import draw_copies, show_copy, show_tokens, shows_again
 from mijax.config import Config
 from mijax.frames import FrameTable
 from mijax.nets.actor_critic import shown
@@ -128,8 +128,20 @@ class Learner:
         return bool(jnp.all(kept > 0))
 
     def _believe(self, state: LearnerState, key: jax.Array) -> AgentState:
-        """Fit Believer's history VAE to as many random episodes as stage 1 has (paper Appendix A.5, Stage 2)."""
+        """Fit Believer's history VAE (paper Appendix A.5, Stage 2) to what stage 1 learns from, as the paper's agents
+        have the same data (5.1): the demonstrations, or as many random episodes."""
         key_start, key_collect, key_update = jax.random.split(key, 3)
+        demonstrated = self.demonstrations > 0 and self.config.stage1.data == "demonstrations"
+        replay = state.replay if demonstrated else self._random_replay(state, key_start, key_collect)
+
+        def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, None]:
+            return self.update(agent, replay, state.representation, key, pretrain=True)[0], None
+
+        agent, _ = jax.lax.scan(update, state.agent, jax.random.split(key_update, self.config.believer.updates))
+        return dataclasses.replace(agent, optimizer=self.agent.optimizer.init(agent.params))
+
+    def _random_replay(self, state: LearnerState, key_start: jax.Array, key_collect: jax.Array) -> Replay:
+        """As many episodes of random actions as stage 1 has, in a replay of their own."""
         num_envs = self.config.num_envs
         open_episodes = start_episodes(self.env, self.agent, num_envs, key_start, self.agent.copies > 0)
         first = self._first(state.representation, open_episodes)
@@ -138,13 +150,7 @@ class Learner:
             state, episodes=open_episodes, replay=write(replay, first, open_episodes.position))
         rounds = -(-self.config.stage1.episodes // num_envs)
         keys = jax.random.split(key_collect, rounds * self.env.horizon)
-        random, _ = self._collect(random, jnp.ones(()), keys)
-
-        def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, None]:
-            return self.update(agent, random.replay, state.representation, key, pretrain=True)[0], None
-
-        agent, _ = jax.lax.scan(update, state.agent, jax.random.split(key_update, self.config.believer.updates))
-        return dataclasses.replace(agent, optimizer=self.agent.optimizer.init(agent.params))
+        return self._collect(random, jnp.ones(()), keys)[0].replay
 
     @property
     def warmup_steps(self) -> int:
@@ -326,7 +332,9 @@ class Learner:
 
     def _read(self, replay: Replay, slots: jax.Array, layout: Layout, rows: int, key: jax.Array) -> Tokens:
         """(B,) episodes in so many rows, shown again where the replay stores moments."""
-        tokens = gather_rows(replay, slots, layout, rows, self.observations)
+        copies = self.agent.copies
+        copy = draw_copies(copies, slots.shape[0], jax.random.fold_in(key, 2)) if copies else None
+        tokens = gather_rows(replay, slots, layout, rows, self.observations, copy if self.agent.looks_once else None)
         if self.imitates:
             episode = jnp.maximum(tokens.segment - 1, 0)
             expert = (slots >= self.config.num_envs) & (slots < self.config.num_envs + self.demonstrations)
@@ -335,11 +343,9 @@ class Learner:
                 enough = jnp.median(returns_of(replay, replay.finished[: self.demonstrations]))
                 succeeded = returns_of(replay, slots) >= enough
                 tokens = dataclasses.replace(tokens, succeeded=succeeded[episode])
-        copies, batch, key = self.agent.copies, slots.shape[0], jax.random.fold_in(key, 2)
         if self.moments:
-            wants_state = self.agent.declaration.critic is not None
-            return show_tokens(self.env, tokens, copies, batch, key, wants_state)
-        return take_copies(tokens, copies, batch, key) if self.agent.looks_once and copies else tokens
+            return show_tokens(self.env, tokens, copy, self.agent.declaration.critic is not None)
+        return tokens
 
 
 def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner:

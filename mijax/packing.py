@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from mijax.frames import FrameTable
-from mijax.replay import Replay
+from mijax.replay import Replay, read_steps
 from mijax.types import Tokens
 
 
@@ -62,11 +62,13 @@ def row_choices(episodes: int) -> tuple[int, ...]:
 
 
 def gather_rows(
-    replay: Replay, slots: jax.Array, layout: Layout, rows: int, observations: FrameTable | None
+    replay: Replay, slots: jax.Array, layout: Layout, rows: int, observations: FrameTable | None,
+    copy: jax.Array | None = None,
 ) -> Tokens:
     """Read (B,) episodes from the replay into `rows` packed rows; `observations` as for `Learner`.
 
-    Segment b + 1 is episode b.
+    Segment b + 1 is episode b. Of a replay that stores what every copy of an episode shows, (B,) int32 `copy` says
+    which of them is read.
     """
     row_length = replay.data.reward.shape[1]
     step = jnp.arange(row_length)[None]
@@ -77,7 +79,7 @@ def gather_rows(
     source = jnp.full((rows * row_length,), -1, jnp.int32).at[target].set(source, mode="drop")
     used = source >= 0
     episode, position = jnp.maximum(source, 0) // row_length, jnp.maximum(source, 0) % row_length
-    data = jax.tree.map(lambda x: x[slots[episode], position], replay.data)
+    data = read_steps(replay, slots[episode], position, None if copy is None else copy[episode])
 
     def shaped(x: jax.Array) -> jax.Array:
         return x.reshape(rows, row_length, *x.shape[1:])
@@ -99,7 +101,7 @@ def gather_rows(
 
 
 def _actions(stored: jax.Array, used: jax.Array) -> jax.Array:
-    """(N,) int32 with -1 where not used, or (N, A) float32, of each copy perhaps, with 0 there."""
+    """(N,) int32 with -1 where not used, or (N, A) float32 with 0 there."""
     if jnp.issubdtype(stored.dtype, jnp.integer):
         return jnp.where(used, stored.astype(jnp.int32), -1)
-    return jnp.where(used.reshape(-1, *[1] * (stored.ndim - 1)), stored, 0)
+    return jnp.where(used[:, None], stored, 0)

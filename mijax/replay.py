@@ -32,6 +32,10 @@ class StepRecord:
     symmetry: jax.Array | None = None  # (E, 2) uint32, the same in all steps of an episode: see `mijax.augmentation`
 
 
+IN_EACH_COPY = ("observation", "previous_action", "z_s", "state", "intended")
+"""What has an axis of copies where what every copy shows is stored."""
+
+
 @struct.dataclass
 class Replay:
     """S = capacity + E slots of L = horizon + 1 steps."""
@@ -109,6 +113,15 @@ def fill(replay: Replay, records: StepRecord, length: jax.Array) -> Replay:
         finished=replay.finished.at[: length.shape[0]].set(slots),
         count=jnp.int32(length.shape[0]),
     )
+
+
+def read_steps(replay: Replay, slots: jax.Array, position: jax.Array, copy: jax.Array | None = None) -> StepRecord:
+    """The steps at (N,) `position` of the episodes in (N,) `slots`, every field (N, ...); with a `copy`, (N,), of what
+    is stored in each copy of an episode only what that one shows, so that the others are never moved."""
+    read = jax.tree.map(lambda x: x[slots, position], dataclasses.replace(replay.data, **dict.fromkeys(IN_EACH_COPY)))
+    here = (slots, position) if copy is None else (slots, position, copy)
+    copied = {name: getattr(replay.data, name) for name in IN_EACH_COPY}
+    return dataclasses.replace(read, **jax.tree.map(lambda x: x[here], copied))
 
 
 def returns_of(replay: Replay, slots: jax.Array) -> jax.Array:

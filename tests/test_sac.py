@@ -24,7 +24,7 @@ from tokens import (
 )
 
 from envs_mjx.base import Demonstrations, TimeStep
-from mijax.agents.core import adam
+from mijax.agents.core import AgentState, adam
 from mijax.agents.factory import make_agent
 from mijax.agents.sac import SAC, make_sac
 from mijax.agents.variants import VARIANTS, needs_representation, title_of
@@ -38,9 +38,10 @@ from mijax.config import (
     SACConfig,
     Stage1Config,
 )
-from mijax.learner import LearnerState, make_learner
+from mijax.learner import Learner, LearnerState, make_learner
 from mijax.losses import sac
 from mijax.packing import one_per_row
+from mijax.replay import Replay
 from mijax.representation.model import networks_for
 from mijax.types import Tokens
 
@@ -544,6 +545,25 @@ def test_every_agent_runs_in_the_loop(agent: str, trunk: Any):
     assert all(np.isfinite(x) for name, x in jax.device_get(metrics).items() if name.startswith(("loss/", "actor/")))
     results = jax.device_get(run.evaluate(state, jax.random.key(0), 3))
     assert (results["length"] == Compass.choice + 1).all()
+
+
+@pytest.mark.lenient
+@pytest.mark.parametrize("data", ["demonstrations", "random"])
+def test_believers_history_model_is_fitted_to_stage_1s_kind_of_episodes(data: Any, monkeypatch: pytest.MonkeyPatch):
+    fitted = []
+
+    def update(_: Learner, agent: AgentState, replay: Replay, *__: Any, **___: Any) -> tuple[AgentState, dict]:
+        fitted.append(replay)
+        return agent, {}
+
+    run = Run(dataclasses.replace(
+        LOOP, agent="believer", memory="auto", stage1=Stage1Config(features=FEATURES, episodes=4, data=data)))
+    state = run.start()
+    monkeypatch.setattr(Learner, "update", update)
+    run.learner._believe(state, jax.random.key(0))
+    shown = data == "demonstrations"
+    assert (fitted[0] is state.replay) is shown
+    assert int(fitted[0].count) >= 4
 
 
 class Spelled(Compass):

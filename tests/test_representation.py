@@ -22,7 +22,17 @@ from mijax.representation.model import evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
 from mijax.representation.problem import Problem
 from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
-from mijax.representation.train import ENCODER_NETWORKS, EstimatorState, club_growth, encode, optimizers, shrink
+from mijax.representation.train import (
+    ENCODER_NETWORKS,
+    EstimatorState,
+    LossWeights,
+    club_growth,
+    encode,
+    encoder_loss,
+    initial_state,
+    optimizers,
+    shrink,
+)
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
 
@@ -157,6 +167,61 @@ def test_clubs_weight_grows_to_its_full_value():
         counted = optax.tree.set(fit.optimizer, count=jnp.int32(done * config.estimator_updates))
         growth = club_growth(config, dataclasses.replace(fit, optimizer=counted), 100)
         np.testing.assert_allclose(growth, expected, rtol=1e-5)
+
+
+WEIGHTS = {"lambda_r": 2.0, "lambda_s": 3.0, "lambda_o": 5.0, "lambda_club": 7.0, "lambda_dim_s": 11.0,
+           "lambda_dim_o": 13.0}
+TERMS = {"lambda_r": "reward_loss", "lambda_s": "z_s_loss", "lambda_o": "z_o_loss", "lambda_club": "club",
+         "lambda_dim_s": "dim_s_loss", "lambda_dim_o": "dim_o_loss"}
+
+
+def objective(env, config: Stage1Config, weights: LossWeights) -> tuple[dict[str, float], dict[str, Any]]:
+    """The terms of stage 1's loss on one batch of fresh networks, and its gradient."""
+    problem = Problem.of(env, config, collect(env, jax.random.key(0), config.episodes))
+    state = initial_state(problem, jax.random.key(1))
+    batch = problem.batch(jnp.arange(config.batch_size), jax.random.key(2))
+    _, estimator_optimizer = optimizers(config, 1, 0.0)
+
+    @jax.jit
+    def gradient(weights: LossWeights) -> Any:
+        return jax.grad(encoder_loss, has_aux=True)(
+            state.parameters, state.estimator, problem, weights, batch, estimator_optimizer)
+
+    gradients, (_, metrics) = gradient(weights)
+    return {name: float(value) for name, value in metrics.items()}, gradients
+
+
+@pytest.mark.lenient
+@pytest.mark.parametrize("kl", [0.0, 0.5])
+def test_the_loss_is_the_weighted_sum_of_algorithm_1(env, kl):
+    """Believer's penalty among its terms where it has a weight (Appendix A.5)."""
+    config = dataclasses.replace(SMALL, **WEIGHTS, lambda_kl=kl)
+    terms, _ = objective(env, config, LossWeights.of(config))
+    expected = sum(WEIGHTS[weight] * terms[term] for weight, term in TERMS.items())
+    assert (terms.get("kl", 0.0) > 0) is (kl > 0)
+    np.testing.assert_allclose(terms["loss"], expected + kl * terms.get("kl", 0.0), rtol=1e-5)
+
+
+@pytest.mark.lenient
+@pytest.mark.parametrize(("weight", "reached"), [
+    ("lambda_r", {"phi", "psi", "dynamics"}), ("lambda_s", {"phi", "psi", "dynamics"}),
+    ("lambda_o", {"phi", "psi", "dynamics"}), ("lambda_club", {"phi", "psi"}),
+    ("lambda_dim_s", {"phi", "discriminator_s"}), ("lambda_dim_o", {"psi", "discriminator_o"})])
+def test_each_term_teaches_the_networks_it_is_about(env, weight, reached):
+    alone = LossWeights.of(dataclasses.replace(SMALL, **dict.fromkeys(WEIGHTS, 0.0) | {weight: WEIGHTS[weight]}))
+    _, gradients = objective(env, dataclasses.replace(SMALL, **WEIGHTS), alone)
+    taught = {name for name, part in gradients.items() if any(np.any(leaf) for leaf in jax.tree.leaves(part))}
+    assert taught == reached
+
+
+@pytest.mark.lenient
+def test_club_takes_information_out(env):
+    ends = []
+    for weight in (0.0, 10.0):
+        config = dataclasses.replace(SMALL, epochs=40, learning_rate=3e-3, lambda_club=weight, club_ramp=0.0)
+        _, history = learn_representation(env, config, jax.random.key(0))
+        ends.append(history.metrics["club"][-1])
+    assert ends[1] < 0.2 * ends[0]
 
 
 @pytest.mark.lenient

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import re
 import shutil
 import signal
 import socket
@@ -18,9 +19,10 @@ from tiny_runs import TINY, comparable
 from mijax import train
 from mijax.config import Config, ConfigError, config_from_dict, parse_seeds
 from mijax.hosts import Host
-from mijax.run_folder import RunError, RunFolder
+from mijax.run_folder import RunFolder
 
 pytestmark = pytest.mark.lenient
+
 
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "mijax.train", *arguments]
@@ -75,7 +77,8 @@ def test_seed_three_alone_is_seed_three_of_many(whole_run: pathlib.Path, tmp_pat
     assert same_file(alone, whole_run, 3, "representation.msgpack")
 
 
-def test_killed_and_resumed_is_never_interrupted(whole_run: pathlib.Path, tmp_path: pathlib.Path) -> None:
+def test_killed_and_resumed_is_never_interrupted(whole_run: pathlib.Path, tmp_path: pathlib.Path,
+                                                 capsys: pytest.CaptureFixture[str]) -> None:
     """On the representations of the run that it equals, taken over with what their probes found; under the strategy
     that is the default here, a device for each seed, where that run had them one after the other."""
     path = tmp_path / "killed"
@@ -88,9 +91,10 @@ def test_killed_and_resumed_is_never_interrupted(whole_run: pathlib.Path, tmp_pa
             break
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not (path / "summary.json").exists(), "the kill came too late to test anything"
+    assert process.wait() == -signal.SIGKILL, "it ended before the kill"
+    assert len(RunFolder.open(path).metrics(0)) >= 3
     assert train.main(["--resume", str(path)]) == 0
+    assert "going on from step" in capsys.readouterr().out
     for seed in (0, 3):
         assert comparable(path, seed) == comparable(whole_run, seed)
         assert same_file(path, whole_run, seed, "probe.json")
@@ -152,11 +156,12 @@ def test_a_corrupt_checkpoint_falls_back_to_the_one_before(whole_run: pathlib.Pa
     assert comparable(path, 0) == comparable(whole_run, 0)
 
 
-def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path,
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
+def test_an_orderly_stop_saves_and_says_how_to_go_on(asked: signal.Signals, tmp_path: pathlib.Path,
                                                      capsys: pytest.CaptureFixture[str]) -> None:
     """Meanwhile no other process can go on with the run, or change what it is asked for."""
     path = tmp_path / "stopped"
-    arguments = ["--agent", "base", "--steps", "100000", *TINY, "--out", str(path)]
+    arguments = ["--agent", "base", "--steps", "100000", *TINY, "--checkpoint.every", "1000", "--out", str(path)]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, text=True, env=environment)
     rows = path / "seed_0" / "metrics.jsonl"
@@ -167,7 +172,7 @@ def test_an_orderly_stop_saves_and_says_how_to_go_on(tmp_path: pathlib.Path,
         assert process.poll() is None
         assert train.main(["--resume", str(path), "--steps", "200000"]) == 1
         assert "another process is at work in it" in capsys.readouterr().err
-        process.send_signal(signal.SIGINT)
+        process.send_signal(asked)
         said, _ = process.communicate(timeout=120)
     finally:
         process.kill()
@@ -295,6 +300,33 @@ def test_devices_are_set_before_an_environment_starts_jax() -> None:
     assert ended.stderr.startswith("error: --steps: got 1, accepted: more than the")
 
 
-def test_divergence_is_named() -> None:
-    with pytest.raises(RunError, match="seed 3: loss/td is nan at step 400"):
-        train._refuse_divergence(3, {"step": 400, "loss/td": np.nan}, "dqn", 1e-3)
+def test_divergence_is_named_and_not_written(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run"
+    arguments = ["--agent", "base", "--memory", "gru", "--steps", "1200", *TINY, "--dqn.learning-rate", "1e30"]
+    assert train.main([*arguments, "--out", str(path)]) == 1
+    assert re.match(r"error: seed 0: loss/\w+ is \S+ at step \d+, .*--dqn\.learning-rate", capsys.readouterr().err)
+    assert all(np.isfinite(row["loss/td"]) for row in RunFolder.open(path).metrics(0))
+
+
+@pytest.mark.parametrize("trunk", [pytest.param("shared", marks=pytest.mark.slow), "z_o"])
+def test_sac_goes_on_where_it_stopped(trunk: str, tmp_path: pathlib.Path) -> None:
+    """With what its replay holds on a robot: demonstrations to imitate, and turned copies of moments or of features."""
+    whole, again = tmp_path / "whole", tmp_path / "again"
+    options = {
+        "memory": "gru", "steps": 120, "num-envs": 2, "steps-per-iteration": 2, "evaluation.every": 20,
+        "evaluation.episodes": 4, "network.gru-width": 8, "stage1.episodes": 20, "stage1.epochs": 2,
+        "stage1.batch-size": 20, "stage1.heldout-episodes": 8, "stage1.features": 4, "sac.trunk": trunk,
+        "sac.batch-episodes": 4, "sac.replay-steps": 400, "sac.warmup-episodes": 4, "sac.demonstrations": 4,
+        "sac.pretrain-updates": 4, "sac.imitation-weight": 1, "sac.rotated-copies": 2, "sac.demonstration-share": 0.5,
+        "checkpoint.every": 1}
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    assert train.main(["--domain", "compass:Compass", *words, "--sac.imitate-successes", "--out", str(whole)]) == 0
+    shutil.copytree(whole, again)
+    steps = sorted(int(path.name) for path in (again / "seed_0" / "checkpoints").iterdir() if path.name.isdigit())
+    assert len(steps) > 1
+    shutil.rmtree(again / "seed_0" / "checkpoints" / str(steps[-1]))
+    (again / "summary.json").unlink()
+    RunFolder.open(again).truncate_after(steps[-2], (0,))
+    assert train.main(["--resume", str(again)]) == 0
+    assert comparable(again, 0) == comparable(whole, 0)
+    assert RunFolder.open(again).metrics(0)[-1]["step"] > steps[-2]

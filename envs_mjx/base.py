@@ -205,3 +205,13 @@ class Environment(abc.ABC):
         """
         del key
         return env_state, action
+
+
+def shows_again(env: Environment) -> bool:
+    """Whether the environment can show a moment again, so that moments can be stored in place of frames."""
+    env_state, _ = jax.eval_shape(env.reset, jax.random.key(0))
+    try:
+        shown = jax.eval_shape(env.show, env_state)
+    except (NotImplementedError, TypeError):  # a user's method of that name may be another
+        return False
+    return isinstance(shown, TimeStep)

@@ -15,6 +15,7 @@ from envs_mjx.base import (
     Environment,
     EnvState,
     TimeStep,
+    shows_again,
 )
 from envs_mjx.errors import UserError, one_line
 
@@ -58,7 +59,7 @@ def check_contract(env: Environment, num_steps: int = 3) -> None:
     listed = env.all_observations()
     if listed is not None:
         _check_list(env, listed)
-    _check_episodes(env, num_steps, listed)
+    _check_episodes(env, num_steps, set() if listed is None else {_bits(seen) for seen in listed})
 
 
 def _require(env: Environment, condition: bool, place: str, got: object, expected: str) -> None:
@@ -160,7 +161,7 @@ def _check_list(env: Environment, listed: object) -> None:
              f"{len(listed)}, each once")
 
 
-def _check_episodes(env: Environment, num_values: int, listed: np.ndarray | None) -> None:
+def _check_episodes(env: Environment, num_values: int, listed: set[bytes]) -> None:
     """Random episodes, side by side, to their ends; values are looked at for some steps of the first."""
     reset = jax.jit(jax.vmap(env.reset))
 
@@ -173,14 +174,18 @@ def _check_episodes(env: Environment, num_values: int, listed: np.ndarray | None
     first, shown = jax.tree.map(lambda x: x[0], (env_state, timestep))
     _require(env, float(shown.reward) == 0, "reward of reset", float(shown.reward), "0")
     _require(env, not bool(shown.done), "terminated or truncated of reset", True, "False")
-    _check_values(env, "reset", first, shown, listed)
+    _check_values(env, "reset", first, shown)
+    _check_listed(env, "reset", timestep, np.ones(_EPISODES, bool), listed)
     running, ends = np.ones(_EPISODES, bool), []
     for time, key in enumerate(jax.random.split(jax.random.key(2), min(env.horizon, _MOST_STEPS))):
         keys, env_state, timestep = step(key, env_state)
         if time < num_values and running[0]:
             first, shown = jax.tree.map(lambda x: x[0], (env_state, timestep))
             _check_timestep(env, "step", shown)
-            _check_values(env, "step", first, shown, listed)
+            _check_values(env, "step", first, shown)
+        if time == 0 and shows_again(env):
+            _check_shown_again(env, env_state, timestep)
+        _check_listed(env, "step", timestep, running, listed)
         ended = running & np.asarray(timestep.terminated | timestep.truncated)
         if ended.any():
             ends += _at_ends(reset, ended, keys, env_state)
@@ -217,9 +222,29 @@ def _resets(ends: list[list[bytes]]) -> bool:
     return any(actual == start and len(set(start)) > 1 for start in starts)
 
 
-def _check_values(
-    env: Environment, place: str, env_state: EnvState, timestep: TimeStep, listed: np.ndarray | None
-) -> None:
+def _check_listed(env: Environment, place: str, timestep: TimeStep, running: np.ndarray, listed: set[bytes]) -> None:
+    """Every observation of the `running` episodes is in the list: one that is not would be stored as another."""
+    for seen in np.asarray(timestep.observation)[running] if listed else ():
+        _require(env, _bits(seen) in listed, f"observation of {place}", _one_line_of(seen),
+                 "one listed by all_observations")
+
+
+def _bits(observation: np.ndarray) -> bytes:
+    """The same for 0.0 and -0.0, which are one number."""
+    return (observation + np.zeros((), observation.dtype)).tobytes()
+
+
+def _check_shown_again(env: Environment, env_state: EnvState, timestep: TimeStep) -> None:
+    """`show` shows what `step` did, but for rounding, as it stands in for it in the replay."""
+    again = jax.jit(jax.vmap(env.show))(env_state)
+    _check_timestep(env, "show", jax.tree.map(lambda x: x[0], again))
+    for field in ("observation", "state"):
+        first, second = (np.asarray(getattr(shown, field), np.float64) for shown in (timestep, again))
+        _require(env, np.allclose(first, second, rtol=1e-3, atol=1e-3), f"the largest change of {field} by show",
+                 float(np.max(np.abs(first - second))), "0, as it is to be what reset or step showed")
+
+
+def _check_values(env: Environment, place: str, env_state: EnvState, timestep: TimeStep) -> None:
     for field in ("observation", "state", "reward"):
         value = np.asarray(getattr(timestep, field))
         if np.issubdtype(value.dtype, np.floating):
@@ -227,10 +252,6 @@ def _check_values(
     for field, spec in (("observation", env.observation_spec), ("state", env.state_spec)):
         empty = np.asarray(getattr(timestep, field))[..., spec.shape[-1] - spec.blank :] if spec.blank else np.zeros(1)
         _require(env, not empty.any(), f"the blank channels of {field} of {place}", "not 0", "0, as the spec declares")
-    if listed is not None:
-        seen = np.asarray(timestep.observation)
-        found = (listed == seen).reshape(len(listed), -1).all(axis=1).any()
-        _require(env, bool(found), f"observation of {place}", _one_line_of(seen), "one listed by all_observations")
     truth = np.asarray(env.ground_truth(env_state))
     for variable, value in zip(env.variables, truth, strict=True):
         if variable.num_values is not None:

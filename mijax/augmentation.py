@@ -14,16 +14,6 @@ from envs_mjx.base import Environment, EnvState, TimeStep
 from mijax.types import Tokens
 
 
-def shows_again(env: Environment) -> bool:
-    """Whether the environment can show a moment again, so that moments can be stored in place of frames."""
-    env_state, _ = jax.eval_shape(env.reset, jax.random.key(0))
-    try:
-        jax.eval_shape(env.show, env_state)
-    except (NotImplementedError, TypeError):  # a user's method of that name may be another
-        return False
-    return True
-
-
 def show_copy(
     env: Environment, symmetry: jax.Array, copy: jax.Array, env_state: EnvState, actions: Any
 ) -> tuple[TimeStep, Any]:

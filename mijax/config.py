@@ -163,7 +163,8 @@ class DQNConfig:
     learning_rate: float = 1e-3
     """Adam step size (paper: 3e-4)."""
     final_learning_rate: float = 0.02
-    """The step size falls linearly to this fraction of itself over the run's steps; 1 keeps it constant (paper: 1)."""
+    """The step size falls linearly to this fraction of itself; 1 keeps it constant (paper: 1). It would be there after
+    as many updates as the run's steps have, those of the warm-up counted, which have none: it ends a little above."""
     discount: float = 0.97
     """gamma of the learner (paper: 0.99). In the three grid worlds the belief-optimal policy is the same for both."""
     trace_decay: float = 0.9
@@ -213,11 +214,12 @@ class SACConfig:
     learning_rate: float = 3e-4
     """Adam step size of the actor, the critics, f and the temperature."""
     final_learning_rate: float = 1.0
-    """The step size falls linearly to this fraction of itself over the run's steps; 1 keeps it constant."""
+    """The step size falls linearly to this fraction of itself, as that of DQN; 1 keeps it constant."""
     discount: float = 0.99
     """gamma of the learner."""
     trace_decay: float = 0.0
-    """lambda of the returns that the critics learn, with uncorrected traces; 0 gives the one-step target."""
+    """lambda of the returns that the critics learn, with uncorrected traces; 0 gives the one-step target. The entropy
+    of the steps that a return goes on through is left out of it."""
     target_rate: float = 0.005
     """tau: how far the target network moves towards the online network after every update."""
     initial_temperature: float = 0.01

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from flax import struct
 from jax.typing import DTypeLike
 
-from envs_mjx.base import DiscreteActions, Environment, EnvState, TimeStep
+from envs_mjx.base import DiscreteActions, Environment, EnvState, TimeStep, shows_again
 from mijax.agents.core import Agent, AgentState
 from mijax.agents.factory import make_agent
 from mijax.agents.state_shown import StateShown
 from mijax.agents.variants import variant
-from mijax.augmentation import draw_copies, show_copy, show_tokens, shows_again
+from mijax.augmentation import draw_copies, show_copy, show_tokens
 from mijax.config import Config
 from mijax.frames import FrameTable
 from mijax.nets.actor_critic import shown
@@ -353,7 +353,7 @@ def make_learner(env: Environment, config: Config, pack: bool = True) -> Learner
     domain, env = env, StateShown(env) if variant(config.agent).sees_state else env
     agent, listed = make_agent(env, config), env.all_observations()
     table = None if listed is None or agent.looks_once else FrameTable(listed)
-    moments = table is None and not agent.looks_once and shows_again(env)
+    moments = table is None and not agent.looks_once and shows_again(domain)
     return Learner(domain, env, config, agent, table, moments, pack)
 
 

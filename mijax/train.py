@@ -355,7 +355,8 @@ def _advance(
     wall = {"compile": compiled + compiled_evaluation, "training": trained - started - compiled,
             "evaluation": ended - trained - compiled_evaluation}
     wall = {f"wall/{part}": max(wall.get(part, 0) + before.get(part, 0), 0) * share for part in {**before, **wall}}
-    iterations = (runner.step - runner.learner.warmup_steps) // config.iteration_steps
+    stepped = (runner.step - runner.learner.warmup_steps) // config.iteration_steps
+    iterations = runner.learner.pretrain_iterations + stepped
     update = iterations * runner.learner.updates_per_iteration
     return {
         seed: {"step": runner.step, "update": update}

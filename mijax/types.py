@@ -57,11 +57,12 @@ class Tokens:
     succeeded: jax.Array | None = None  # (R, L) bool, whether it returns what an expert's does; None: not wanted
 
     def folds(self) -> "tuple[Tokens, Tokens]":
-        """The upper and the lower half of the rows: of a batch of `sample_episodes`, its two folds."""
+        """The two halves of the rows, without their states: of a batch of `sample_episodes`, its two folds."""
         rows, length = self.segment.shape
         halves = []
         for part in (slice(None, rows // 2), slice(rows // 2, None)):
-            half = jax.tree.map(lambda x, part=part: x[part], dataclasses.replace(self, frames=None, frame=None))
+            rest = dataclasses.replace(self, frames=None, frame=None, states=None)
+            half = jax.tree.map(lambda x, part=part: x[part], rest)
             if isinstance(self.frames, jax.Array):
                 own = self.frames.reshape(rows, length, *self.frames.shape[1:])[part]
                 half = dataclasses.replace(half, frames=own.reshape(-1, *self.frames.shape[1:]))

@@ -21,6 +21,7 @@ from envs_mjx.base import (
     Environment,
     EnvState,
     TimeStep,
+    shows_again,
 )
 from envs_mjx.contract import ContractError, check_contract
 from envs_mjx.grid import HeavenHell
@@ -265,6 +266,15 @@ def _resetting(where: int):
     return Resetting()
 
 
+class _Late(HeavenHell):
+    """Shows something that is not listed, in the middle of an episode."""
+
+    def step(self, key, env_state, action):
+        later, timestep = super().step(key, env_state, action)
+        observation = timestep.observation + jnp.where(later.time == 8, 5.0, 0.0)
+        return later, dataclasses.replace(timestep, observation=observation)
+
+
 @pytest.mark.parametrize(("env", "message"), [
     (_with_timestep(reward=lambda x: x.astype(jnp.int32)), r"reward of step is 'int32\[\]', expected float32\[\]"),
     (_with_timestep(reward=lambda x: x[None]), r"reward of step is 'float32\[1\]', expected float32\[\]"),
@@ -286,6 +296,8 @@ def _resetting(where: int):
     (_with(all_observations=lambda self: np.zeros((4, 2), np.float32)), r"all_observations is 'float32\[2\]'"),
     (_with(all_observations=lambda self: np.zeros((4, 3), np.float32)), "different observations .* is 1, expected 4"),
     (_with(all_observations=lambda self: np.zeros((1, 3), np.float32)), "expected one listed by all_observations"),
+    (_Late(), "observation of step is .* expected one listed by all_observations"),
+    (_with(show=lambda self, env_state: self.reset(jax.random.key(0))[1]), "the largest change of .* by show is"),
     (_with(reset=lambda self, key: None), "what reset returns is 'NoneType'"),
     (_with(step=lambda self, key, env_state, action: (env_state.cell, self.reset(key)[1])), "the EnvState of step"),
     (_with(step=lambda self, key, env_state, action: (
@@ -308,6 +320,12 @@ def test_broken_contracts(env: Environment, message: str) -> None:
     with pytest.raises(ContractError, match=message) as caught:
         check_contract(env)
     assert "\n" not in str(caught.value)
+
+
+def test_a_method_of_the_same_name_does_not_show_moments() -> None:
+    env = _with(show=lambda self, env_state: jnp.zeros((8, 8, 3)))
+    assert not shows_again(env)
+    check_contract(env)
 
 
 class _Contexts(Environment):

@@ -222,10 +222,10 @@ class Agent(abc.ABC):
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """f's loss, and (R, L) the weighted bonus for arriving at each token.
 
-        Two models f, each trained on one fold of the episodes; the bonus of an episode comes from the one that never
-        saw it. A single f learns the episodes of the replay by heart: at step 45 of episodes without any information it
-        explained 0.83 of z_s (measured, Heaven-Hell, 12 000 steps), and the bonus then pays for wandering about.
-        The bonus of an episode's first token is meaningless; no target uses it.
+        With `--information.folds 2` two models f, each trained on one fold of the episodes; the bonus of an episode
+        comes from the one that never saw it. A single f learns the episodes of the replay by heart: at step 45 of
+        episodes without any information it explained 0.83 of z_s (measured, Heaven-Hell, 12 000 steps), and the bonus
+        then pays for wandering about. The bonus of an episode's first token is meaningless; no target uses it.
         """
         options, variance, z_s = self.config.information, representation.z_s_variance, cast(jax.Array, tokens.z_s)
         real = tokens.segment > 0
@@ -240,13 +240,14 @@ class Agent(abc.ABC):
             f_t = jnp.concatenate([
                 self._clean(self.information_model, *arguments) for arguments in zip(params[::-1], folds, strict=True)])
             f_t = jax.lax.stop_gradient(representation.destandardise(f_t))
-        _, parts_t = info.prediction_mse(f_t, z_s, real, variance)
         f_tm1 = jnp.roll(f_t, 1, axis=1)
         if options.intrinsic_form == "cosine":
             bonus = info.cosine_bonus(z_s, f_t, f_tm1)
         else:
             bonus = info.explained_variance_bonus(z_s, f_t, f_tm1, variance)
-        metrics = {"loss/f": loss_f, "f/explained": parts_f["explained"], "f/explained_unseen": parts_t["explained"]}
+        metrics = {"loss/f": loss_f, "f/explained": parts_f["explained"]}
+        if len(params) == 2:
+            metrics["f/explained_unseen"] = info.prediction_mse(f_t, z_s, real, variance)[1]["explained"]
         return loss_f, options.intrinsic_weight * bonus, metrics
 
     def _auxiliary(

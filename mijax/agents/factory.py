@@ -2,12 +2,11 @@
 
 import jax
 
-from envs_mjx.base import DiscreteActions, Environment
+from envs_mjx.base import DiscreteActions, Environment, shows_again
 from mijax.agents.core import Agent
 from mijax.agents.dqn import make_dqn
 from mijax.agents.sac import make_sac
 from mijax.agents.variants import memory_of, needs_representation
-from mijax.augmentation import shows_again
 from mijax.config import Config, require
 
 

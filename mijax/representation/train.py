@@ -400,7 +400,7 @@ def _refuse_divergence(metrics: dict[str, float], epoch: int, config: Stage1Conf
 
 
 def representation_of(problem: Problem, state: TrainState) -> Representation:
-    """The encoders, with the moments of z_s over all transitions."""
+    """The encoders, with the moments of z_s over all transitions as they were, without their augmented copies."""
     data = problem.data
     phi = state.parameters["phi"]
     z = encode_frames(problem.networks.phi, phi, data.states)

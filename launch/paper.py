@@ -194,16 +194,19 @@ def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
         note = note_on(request, domains[:number], steps)
         if missing:
             note += f". Left out: {', '.join(missing)}"
-        if any(start for group in starts.values() for start in group.values()):
-            note += ". Dashed vertical: stage 1's random steps end, task learning starts" + began(starts)
+        note += began(starts)
         figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note, starts=starts)
         write_table(name, request, experiment.title, groups, starts, note)
 
 
 def began(starts: dict[str, dict[str, int]]) -> str:
-    """How many of stage 1's steps there are, where it is one number."""
-    numbers = {start for group in starts.values() for start in group.values() if start}
-    return f" ({numbers.pop():,} steps)" if len(numbers) == 1 else ""
+    """Whose curves begin where stage 1's random steps end, and how many these are, where it is one number."""
+    begun = {label: start for group in starts.values() for label, start in group.items() if start}
+    if not begun:
+        return ""
+    numbers = set(begun.values())
+    steps = f"the {numbers.pop():,}" if len(numbers) == 1 else "the"
+    return f". Dashed vertical: {steps} random steps of stage 1 end, which come before the curve of {', '.join(begun)}"
 
 
 def write_table(

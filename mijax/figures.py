@@ -1,9 +1,10 @@
 """Figures in one style: learning curves of runs on shared axes, and the trade-off of a search."""
 
 import dataclasses
+import functools
 import pathlib
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -84,11 +85,12 @@ def draw_curves(runs: Sequence[ReportedRun], path: pathlib.Path, *, panels: Sequ
         figure.savefig(path)
 
 
-def _draw_mean(axis: Axes, run: ReportedRun, curves: Sequence[tuple[np.ndarray, np.ndarray]], faint: float) -> None:
+def _draw_mean(axis: Axes, run: ReportedRun, curves: Sequence[tuple[np.ndarray, np.ndarray]], faint: float,
+               each: bool = True) -> None:
     steps, values = statistics.onto_shared_steps(curves)
     mean, std = statistics.mean_std(values)
     if len(curves) > 1:
-        for seed_steps, seed_values in curves:
+        for seed_steps, seed_values in curves if each else ():
             axis.plot(seed_steps, seed_values, color=run.colour, linewidth=0.6, alpha=0.35 * faint)
         axis.fill_between(steps, mean - std, mean + std, color=run.colour, alpha=0.16 * faint, linewidth=0)
     axis.plot(steps, mean, color=run.colour, linewidth=1.8, label=_legend_label(run), solid_capstyle="round")
@@ -162,9 +164,18 @@ def display_name(domain: str) -> str:
     return f"{shown} ({arguments.replace(',', ', ')})" if arguments else shown
 
 
+SMOOTH = 5
+"""Evaluations that a point of `draw_groups` is the mean of."""
+SEEDS_OF_IQM = 4
+"""With fewer nothing is cut off: the interquartile mean is the mean."""
+MOST_WITH_SEEDS = 3
+"""Runs beside each other of which every seed is drawn."""
+
+
 def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path, *, title: str, note: str = "",
                 starts: Mapping[str, Mapping[str, int]] | None = None, panel: Panel = RETURN_AND_SUCCESS[1]) -> None:
-    """Draw groups of runs side by side: above mean and standard deviation as in the paper, below interquartile means.
+    """Draw groups of runs side by side: above mean and standard deviation as in the paper, below interquartile means
+    where a run has seeds enough (of less than four it is the mean).
 
     Args:
         groups: the runs of each column, by its title.
@@ -173,18 +184,25 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
         note: printed under the figure: budgets and seeds.
         starts: by group and label, the environment steps that came before the run: its curve begins there, at a dashed
             vertical line.
-        panel: the quantity.
+        panel: the quantity, as means over the last `SMOOTH` evaluations.
     """
+    every = [run for runs in groups.values() for run in runs]
+    several_seeds = any(len(run.metrics) > 1 for run in every)
+    drawings: dict[str, Callable] = {
+        "mean, one std" if several_seeds else "one seed": functools.partial(
+            _draw_mean, each=len(every) <= MOST_WITH_SEEDS)}
+    if any(len(run.metrics) >= SEEDS_OF_IQM for run in every):
+        drawings["IQM, 95 % interval"] = _draw_interquartile_mean
     with mpl.rc_context(STYLE):
         width = max(5.6, 0.8 + 3.5 * len(groups))
-        figure = Figure(figsize=(width, 6.0), layout="constrained")
-        axes, entries = figure.subplots(2, len(groups), sharey=True, sharex="col", squeeze=False), {}
+        figure = Figure(figsize=(width, 1.6 + 2.2 * len(drawings)), layout="constrained")
+        axes, entries = figure.subplots(len(drawings), len(groups), sharey=True, sharex="col", squeeze=False), {}
         for (name, runs), column in zip(groups.items(), axes.T, strict=True):
             offsets = (starts or {}).get(name, {})
-            for axis, draw in zip(column, (_draw_mean, _draw_interquartile_mean), strict=True):
+            for axis, draw in zip(column, drawings.values(), strict=True):
                 for run in runs:
                     offset = offsets.get(run.label, 0)
-                    curves = [(steps + offset, values) for steps, values in run.curves(panel.metric)]
+                    curves = [(steps + offset, values) for steps, values in run.curves(panel.metric, SMOOTH)]
                     if curves:
                         draw(axis, run, curves, faint=0.6 if len(runs) > 3 else 1.0)
                 for start in {start for start in offsets.values() if start}:
@@ -194,7 +212,7 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
             _label_steps(column[-1], runs, (panel,))
             column[-1].set_xlim(0, column[-1].get_xlim()[1] + max(offsets.values(), default=0))
             entries |= dict(zip(*reversed(column[0].get_legend_handles_labels()), strict=True))
-        for axis, name in zip(axes[:, 0], ("mean, one std", "IQM, 95 % interval"), strict=True):
+        for axis, name in zip(axes[:, 0], drawings, strict=True):
             axis.set_ylabel(f"{panel.label}\n{name}")
             if panel.limits:
                 axis.set_ylim(*panel.limits)
@@ -204,7 +222,8 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
                                ncols=2 if len(groups) == 1 else 2 * len(groups), title=title, alignment="left")
         legend.get_title().set(fontsize=12, fontweight="bold")
         if note:
-            lines = textwrap.fill(note, int(CHARACTERS_PER_INCH * width))
+            smoothing = f"Running mean over {SMOOTH} evaluations. "
+            lines = textwrap.fill(smoothing + note, int(CHARACTERS_PER_INCH * width))
             figure.supxlabel(lines, x=0.01, ha="left", fontsize=7.5, color="#666666")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)

@@ -122,9 +122,7 @@ def comparison_table(runs: Sequence[ReportedRun], starts: Mapping[str, int] | No
     """
     starts = starts or {}
     begun = [starts.get(run.label, 0) for run in runs]
-    ends = (start + int(steps[-1]) for run, start in zip(runs, begun, strict=True)
-            for steps, _ in run.curves("evaluation/success"))
-    last = min(ends, default=0)
+    last = _last_shared(runs, starts)
     areas = [_areas(run, start, last) for run, start in zip(runs, begun, strict=True)]
     speeds = [_speeds(run, start) for run, start in zip(runs, begun, strict=True)]
     table = []
@@ -148,6 +146,12 @@ def comparison_table(runs: Sequence[ReportedRun], starts: Mapping[str, int] | No
                              f"p_{name}_high": float(estimate.high)}
         table.append(line)
     return table
+
+
+def _last_shared(runs: Sequence[ReportedRun], starts: Mapping[str, int]) -> int:
+    """The last step that all seeds reached, those before a run counted."""
+    ends = (starts.get(run.label, 0) + int(steps[-1]) for run in runs for steps, _ in run.curves("evaluation/success"))
+    return min(ends, default=0)
 
 
 def _column(seeds: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
@@ -192,11 +196,12 @@ def comparison_markdown(runs: Sequence[ReportedRun], starts: Mapping[str, int] |
                 low, high = readable(line[f"p_{name}_low"]), readable(line[f"p_{name}_high"])
                 cells[title] = f"{readable(line[f'p_{name}'])} [{low}, {high}]"
         lines.append(cells)
+    last = _last_shared(runs, starts or {})
     return (f"{markdown_table(lines)}\n\nMean ± standard deviation over seeds, interquartile mean (IQM). Area: mean of "
-            f"the success curve. Solved: any evaluation with success >= {SOLVED}; steps to solve: those before the "
-            "first one, the median over seeds. Stage 1's random steps count, without success. P: probability that a "
-            "seed of the first line beats one of this line, ties half, with its 95 % bootstrap interval, which says "
-            "little of three seeds.\n")
+            f"the success curve up to step {last:,}, the last that all of them reached: other tables end elsewhere. "
+            f"Solved: any evaluation with success >= {SOLVED}; steps to solve: those before the first one, the median "
+            "over seeds. Stage 1's random steps count, without success. P: probability that a seed of the first line "
+            "beats one of this line, ties half, with its 95 % bootstrap interval, which says little of three seeds.\n")
 
 
 def plain_markdown(table: Table) -> str:

@@ -1,6 +1,6 @@
 # `make train` and `make test` need nothing but Python >= 3.11: they make .venv, install into it, and run.
 #
-#   make train [OUT=runs/heaven_hell] [ARGS="--seeds 5"]   a new run, or on with the one in OUT
+#   make train [OUT=runs/heaven_hell] [ARGS="--seeds 5"]   a new run with ARGS; or on with the one in OUT, as it was begun
 #   make test  [ARGS="-k losses"]                          the tests, without the slow ones
 #   make test-slow   make lint   make bench   make clean
 #   make viewer      the scripts inside the pages of `mijax.evaluate --planner --html`; needs npm
@@ -24,7 +24,7 @@ train: $(INSTALLED)
 	@if [ -f "$(OUT)/summary.json" ]; then \
 		echo "$(OUT) is finished (see $(OUT)/summary.json and curve.png). Another run: make train OUT=runs/other"; \
 	elif [ -f "$(OUT)/config.json" ]; then \
-		$(RUN) -m mijax.train --resume "$(OUT)" $(ARGS); \
+		$(RUN) -m mijax.train --resume "$(OUT)"; \
 	else \
 		$(RUN) -m mijax.train --domain heaven_hell --out "$(OUT)" $(ARGS); \
 	fi

@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from mijax.figures import display_name
 from mijax.page.episodes import Episodes
 from mijax.page.numbers import curve_data, option_data
 from mijax.results import AGENT_COLOURS, SOLVED, ReportedRun
@@ -56,7 +57,8 @@ def page_data(runs: Sequence[ReportedRun], episodes: Sequence[Episodes | str | N
             {"label": run.label, "domain": run.domain, "colour": run.colour, "optimum": dict(run.optimum),
              "curves": curve_data(run, smooth, points), "episodes": shown}
             for run, shown in zip(runs, episodes, strict=True)],
-        "run_table": run_table(runs), "seed_table": seed_table(runs), "options": option_data(runs),
+        "names": {run.domain: display_name(run.domain) for run in runs}, "run_table": run_table(runs),
+        "seed_table": seed_table(runs), "options": option_data(runs),
         "smooth": smooth, "note": note, "solved": SOLVED, "palette": list(AGENT_COLOURS.values()),
     }
 
@@ -67,7 +69,6 @@ def render(data: Mapping[str, Any]) -> str:
     scripts = "\n".join(_read(name) for name in _SCRIPTS)
     return (_read("page.html").replace("/*STYLE*/", _read("page.css")).replace("/*SCRIPTS*/", scripts)
             .replace("/*DATA*/", blob))
-
 
 
 def read_data(path: pathlib.Path) -> dict[str, Any]:

@@ -189,7 +189,7 @@ function fillQuantities() {
     return;
   }
   byId("domain-label").hidden = domains.length < 2;
-  select(byId("domain"), domains.map((domain) => [domain, domainName(domain)]));
+  select(byId("domain"), domains.map((domain) => [domain, DATA.names[domain]]));
   fillQuantities();
   const redraw = () => { curves.step = null; drawCurves(); };
   byId("domain").addEventListener("change", (event) => {

@@ -53,11 +53,6 @@ function heading(name) {
   return known[name] ?? name.replaceAll("_", " ");
 }
 
-function domainName(domain) {
-  if (domain.includes(":")) return domain.split(":").pop();
-  return domain.split("_").map((word) => word[0].toUpperCase() + word.slice(1)).join(" ");
-}
-
 function nearest(sorted, value) {
   let best = 0;
   for (let i = 1; i < sorted.length; i++) {
@@ -67,7 +62,7 @@ function nearest(sorted, value) {
 }
 
 const domains = [...new Set(DATA.runs.map((run) => run.domain))];
-byId("title").textContent = domains.map(domainName).join(", ");
+byId("title").textContent = domains.map((domain) => DATA.names[domain]).join(", ");
 document.title = `${byId("title").textContent} – mijax`;
 byId("note").textContent = [
   DATA.runs.map((run) => run.label).join(" · "),

@@ -4,9 +4,10 @@ Every strategy runs the same two functions, `Learner.init` and `Learner.run_chun
 
 * `map`: one compiled program, one seed after the other.
 * `shard`: the same, with the seeds dealt out to the devices, which work side by side.
-* `vmap`: one program batched over the seeds; packing is off, since a batched branch would run every branch. Dropout
-  and the noise of actions, which are drawn in the shape of the rows, are others then. Two branches stay and both run:
-  a robot's episodes are begun at every step, and CarFlag-2D's few frames are encoded beside all of them.
+* `vmap`: the seeds of a device in one batched program, all devices side by side; packing is off, since a batched branch
+  would run every branch. Dropout and the noise of actions, which are drawn in the shape of the rows, are others then.
+  Two branches stay and both run: a robot's episodes are begun at every step, and CarFlag-2D's few frames are encoded
+  beside all of them.
 """
 
 import collections
@@ -54,42 +55,47 @@ class SeedRunner:
         """
         self.seeds = tuple(seeds)
         self.strategy = resolve(strategy, len(self.seeds))
-        self.learner = make_learner(self.strategy != "vmap")
-        devices = jax.local_devices() if self.strategy == "shard" else jax.local_devices()[:1]
-        self._device = {seed: devices[i % len(devices)] for i, seed in enumerate(self.seeds)}
-        self._pool = ThreadPoolExecutor(len(set(self._device.values())))
-        mapped = jax.vmap if self.strategy == "vmap" else lambda f: f
+        self._batched = self.strategy == "vmap"
+        self.learner = make_learner(not self._batched)
+        devices = jax.local_devices()[: 1 if self.strategy == "map" else len(self.seeds)]
+        groups = [self.seeds[i :: len(devices)] for i in range(len(devices))] if self._batched else [
+            (seed,) for seed in self.seeds]
+        self._groups = {group[0]: group for group in groups}  # seeds that are run as one, named by the first of them
+        self._device = {first: devices[i % len(devices)] for i, first in enumerate(self._groups)}
+        self._pool = ThreadPoolExecutor(len(devices))
+        mapped = jax.vmap if self._batched else lambda f: f
         self._mapped = mapped
         self._evaluations: dict[int, Callable] = {}  # by number of episodes
         self._init = jax.jit(mapped(self.learner.init))
         chunk = self.learner.run_chunk
-        self._chunk = jax.jit(jax.vmap(chunk, (0, None, None)) if self.strategy == "vmap" else chunk, donate_argnums=0)
-        self._states: dict[int, LearnerState] = {}  # by seed; under vmap one state of all, stored by the first seed
+        self._chunk = jax.jit(jax.vmap(chunk, (0, None, None)) if self._batched else chunk, donate_argnums=0)
+        self._states: dict[int, LearnerState] = {}  # by group
 
-    def compile(self, template: LearnerState) -> None:
+    def compile(self, template: LearnerState) -> list[jax.stages.Compiled]:
         """Compile the learning program for the devices in use. Without it the first chunk does so, when compiling and a
         full-sized replay need memory at once.
 
         Args:
             template: shapes of one seed's state.
+
+        Returns:
+            What each device runs.
         """
-        several = (len(self.seeds),) if self.strategy == "vmap" else ()
-
-        def work(device: Any) -> None:
-            sharding = jax.sharding.SingleDeviceSharding(device)
+        def work(first: int) -> jax.stages.Compiled:
+            several = (len(self._groups[first]),) if self._batched else ()
+            sharding = jax.sharding.SingleDeviceSharding(self._device[first])
             state = jax.tree.map(lambda x: x.update(shape=several + x.shape, sharding=sharding), template)
-            with jax.default_device(device):
-                self._chunk.lower(state, jnp.int32(1), jnp.bool_(True)).compile()
+            with jax.default_device(self._device[first]):
+                return self._chunk.lower(state, jnp.int32(1), jnp.bool_(True)).compile()
 
-        list(self._pool.map(work, dict.fromkeys(self._device.values())))
+        one_of_each = {device: first for first, device in reversed(self._device.items())}
+        return list(self._pool.map(work, sorted(one_of_each.values(), key=self.seeds.index)))
 
     def init(self, representations: dict[int, Representation] | None) -> None:
         """Start every seed from scratch, each with its own representation."""
         rep = {seed: None if representations is None else representations[seed] for seed in self.seeds}
         keys = {seed: training_key(seed) for seed in self.seeds}
-        if self.strategy == "vmap":
-            keys, rep = self._stack(keys), self._stack(rep)
-        self._states = self._each(lambda key, rep: self._init(key, rep), keys, rep)
+        self._states = self._each(self._init, self._by_group(keys), self._by_group(rep))
 
     def pretrain(self, report: Callable[[int], None]) -> None:
         """Updates on the demonstrations, where there are any: up to the first step. A chunk at a time, after which
@@ -100,15 +106,12 @@ class SeedRunner:
 
     def states(self) -> dict[int, LearnerState]:
         """The state of every seed, for a checkpoint."""
-        if self.strategy != "vmap":
-            return dict(self._states)
-        stacked = self._states[self.seeds[0]]
-        return {seed: jax.tree.map(lambda x, i=i: x[i], stacked) for i, seed in enumerate(self.seeds)}
+        return self._of_each_seed(self._states)
 
     def restore(self, states: dict[int, LearnerState]) -> None:
         """Go on from the states of a checkpoint, whatever strategy wrote it."""
-        states = self._stack(states) if self.strategy == "vmap" else states
-        self._states = {seed: jax.device_put(state, self._device[seed]) for seed, state in states.items()}
+        grouped = self._by_group(states)
+        self._states = {first: jax.device_put(state, self._device[first]) for first, state in grouped.items()}
 
     @property
     def step(self) -> int:
@@ -128,12 +131,12 @@ class SeedRunner:
 
     def advance(self) -> dict[int, dict[str, float]]:
         """Run one chunk of every seed; metrics by seed."""
-        return self._by_seed(self._run(self.learner.iterations_per_chunk, acts=True))
+        return self._as_numbers(self._run(self.learner.iterations_per_chunk, acts=True))
 
     def _run(self, iterations: int, acts: bool) -> dict[int, Metrics]:
         results = self._each(lambda state: self._chunk(state, jnp.int32(iterations), jnp.bool_(acts)), self._states)
-        self._states = {seed: state for seed, (state, _) in results.items()}
-        return {seed: metrics for seed, (_, metrics) in results.items()}
+        self._states = {first: state for first, (state, _) in results.items()}
+        return {first: metrics for first, (_, metrics) in results.items()}
 
     def evaluate(self, num_episodes: int) -> dict[int, dict[str, float]]:
         """Greedy evaluation of every seed: means over the episodes."""
@@ -142,13 +145,12 @@ class SeedRunner:
             return jax.tree.map(jnp.mean, self.learner.evaluate(state, key, num_episodes))
 
         program = self._evaluations.setdefault(num_episodes, jax.jit(self._mapped(one)))
-        keys = {seed: evaluation_key(seed, self.step) for seed in self.seeds}
-        keys = self._stack(keys) if self.strategy == "vmap" else keys
-        return self._by_seed(self._each(program, self._states, keys))
+        keys = self._by_group({seed: evaluation_key(seed, self.step) for seed in self.seeds})
+        return self._as_numbers(self._each(program, self._states, keys))
 
     def environment_seconds(self) -> float:
-        """Seconds in which the whole run, all seeds, acted, stepped and stored: timed on one chunk of the first seed,
-        for as many as the busiest device has."""
+        """Seconds in which the whole run, all seeds, acted, stepped and stored: timed on one chunk of the first,
+        for as many of its kind as the busiest device runs one after the other."""
         def stored(state: LearnerState) -> Any:
             # All of the replay is looked at, or XLA would leave its writing out.
             return jax.tree.map(total, self.learner.collect_chunk(state))
@@ -164,29 +166,39 @@ class SeedRunner:
             jax.block_until_ready(program(self._states[seed]))
             seconds.append(time.perf_counter() - started)
         chunks = self.step / self.learner.config.evaluation.every
-        on_one_device = max(collections.Counter(self._device.values()).values())
-        return seconds[-1] * chunks * (1 if self.strategy == "vmap" else on_one_device)
+        return seconds[-1] * chunks * max(collections.Counter(self._device.values()).values())
 
-    def _stack(self, by_seed: dict[int, Any]) -> dict[int, Any]:
-        return {self.seeds[0]: jax.tree.map(lambda *x: jnp.stack(x), *(by_seed[seed] for seed in self.seeds))}
+    def _by_group(self, by_seed: dict[int, Any]) -> dict[int, Any]:
+        """Of each seed, or of each group of batched seeds with a leading axis for them."""
+        if not self._batched:
+            return dict(by_seed)
+        return {first: jax.tree.map(lambda *x: jnp.stack(x), *(by_seed[seed] for seed in group))
+                for first, group in self._groups.items()}
 
-    def _each(self, function: Callable, *by_seed: dict[int, Any]) -> dict[int, Any]:
-        """Apply to every seed on its device; devices work side by side, the seeds of one device in order."""
+    def _of_each_seed(self, by_group: dict[int, Any]) -> dict[int, Any]:
+        """`_by_group` undone."""
+        if not self._batched:
+            return dict(by_group)
+        found = {seed: jax.tree.map(lambda x, i=i: x[i], by_group[first])
+                 for first, group in self._groups.items() for i, seed in enumerate(group)}
+        return {seed: found[seed] for seed in self.seeds}
+
+    def _each(self, function: Callable, *by_group: dict[int, Any]) -> dict[int, Any]:
+        """Apply to every group on its device; devices work side by side, the groups of one device in order."""
 
         def work(device: Any) -> dict[int, Any]:
             results = {}
             with jax.default_device(device):
-                for seed in (s for s in by_seed[0] if self._device[s] == device):
-                    arguments = (jax.device_put(values[seed], device) for values in by_seed)
-                    results[seed] = jax.block_until_ready(function(*arguments))
+                for first in (name for name in by_group[0] if self._device[name] == device):
+                    arguments = (jax.device_put(values[first], device) for values in by_group)
+                    results[first] = jax.block_until_ready(function(*arguments))
             return results
 
-        done = self._pool.map(work, dict.fromkeys(self._device[seed] for seed in by_seed[0]))
-        merged = {seed: result for part in done for seed, result in part.items()}
-        return {seed: merged[seed] for seed in by_seed[0]}
+        done = self._pool.map(work, dict.fromkeys(self._device[first] for first in by_group[0]))
+        merged = {first: result for part in done for first, result in part.items()}
+        return {first: merged[first] for first in by_group[0]}
 
-    def _by_seed(self, metrics: dict[int, Metrics]) -> dict[int, dict[str, float]]:
-        if self.strategy == "vmap":
-            stacked = jax.device_get(metrics[self.seeds[0]])
-            return {seed: {k: float(v[i]) for k, v in stacked.items()} for i, seed in enumerate(self.seeds)}
-        return {seed: {k: float(v) for k, v in jax.device_get(m).items()} for seed, m in metrics.items()}
+    def _as_numbers(self, metrics: dict[int, Metrics]) -> dict[int, dict[str, float]]:
+        """By seed."""
+        return {seed: {name: float(value) for name, value in own.items()}
+                for seed, own in self._of_each_seed(jax.device_get(metrics)).items()}

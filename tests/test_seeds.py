@@ -11,6 +11,7 @@ import pytest
 from tokens import FEATURES, TINY, representation
 
 from envs_mjx import registry
+from launch.scale import gflop, traffic
 from mijax.config import Config, DQNConfig, EvaluationConfig, SeedStrategy, Stage1Config
 from mijax.learner import LearnerState, make_learner
 from mijax.seeds import SeedRunner, resolve, training_key
@@ -66,7 +67,7 @@ class Followed:
         jax.monitoring.register_event_duration_secs_listener(listener)
         env = registry.make("heaven_hell")
         self.runner = fresh(SEEDS, strategy)
-        self.runner.compile(jax.eval_shape(
+        self.programs = self.runner.compile(jax.eval_shape(
             self.runner.learner.init, training_key(0), representation(env, 0)))
         self.compiled_at_first = compiled.copy()
         self.runner.init({seed: representation(env, seed) for seed in SEEDS})
@@ -125,10 +126,32 @@ def test_seeds_have_their_own_representations_and_ways(follow: Callable[[SeedStr
         assert not equal(states[seed].replay.data.z_s, states[(seed + 1) % 3].replay.data.z_s)
 
 
-def test_shard_uses_every_device(follow: Callable[[SeedStrategy], Followed]) -> None:
-    states = follow("shard").runner.states()
+@pytest.mark.parametrize("strategy", ["shard", "vmap"])
+def test_every_device_is_used(follow: Callable[[SeedStrategy], Followed], strategy: SeedStrategy) -> None:
+    states = follow(strategy).runner.states()
+    assert list(states) == list(SEEDS)
     devices = {seed: next(iter(state.iteration.devices())) for seed, state in states.items()}
     assert len(set(devices.values())) == len(jax.local_devices()) == 2
+
+
+@pytest.mark.parametrize("strategy", ["shard", "vmap"])
+def test_devices_work_alone(follow: Callable[[SeedStrategy], Followed], strategy: SeedStrategy) -> None:
+    """Nothing passes between them, and under `shard` each does what one does with one seed."""
+    programs = follow(strategy).programs
+    assert len(programs) == 2
+    assert [traffic(program) for program in programs] == [0, 0]
+    if strategy == "shard":
+        alone, = follow("map").programs
+        assert [gflop(program) for program in programs] == [gflop(alone)] * 2
+        assert gflop(alone) > 0
+
+
+def test_traffic_is_seen() -> None:
+    mesh = jax.make_mesh((2,), ("seeds",), axis_types=(jax.sharding.AxisType.Auto,))
+    spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("seeds"))
+    shape = jax.ShapeDtypeStruct((8,), np.float32, sharding=spread)
+    assert traffic(jax.jit(lambda x: x - x.mean()).lower(shape).compile()) > 0
+    assert traffic(jax.jit(lambda x: x * 2).lower(shape).compile()) == 0
 
 
 def test_a_seed_alone_is_the_same_bit_for_bit(follow: Callable[[SeedStrategy], Followed]) -> None:

@@ -4,32 +4,28 @@ import functools
 import pathlib
 from typing import Any
 
+import gymnasium
+import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
 
 from envs_mjx import registry
+from envs_mjx.adapters.gymnasium import AsGymnasium, FromGymnasium
+from envs_mjx.adapters.gymnax import FromGymnax
 from envs_mjx.base import ContinuousActions, Variable
 from envs_mjx.contract import check_contract
+from examples.gymnasium_memory import LENGTH, Maze, TMaze
 from mijax import train
 from mijax.run_folder import RunFolder
-
-gymnasium = pytest.importorskip("gymnasium")
-gymnax = pytest.importorskip("gymnax")
-
-from gymnasium import spaces  # noqa: E402
-from gymnasium.utils.env_checker import check_env  # noqa: E402
-
-from envs_mjx.adapters.gymnasium import AsGymnasium, FromGymnasium  # noqa: E402
-from envs_mjx.adapters.gymnax import FromGymnax  # noqa: E402
-from examples.gymnasium_memory import LENGTH, Maze, TMaze  # noqa: E402
 
 ROBOTS = {"block_pulling", "block_pushing", "drawer_opening"}
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m")
-@pytest.mark.filterwarnings("ignore:.*not within the observation space")
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=[pytest.mark.slow] if name in ROBOTS else []) for name in registry.names()])
 def test_every_domain_passes_gymnasiums_own_check(name: str):

@@ -1,9 +1,11 @@
 """The robots' experts from the command line: pictures, pages and refusals."""
 
+import base64
 import dataclasses
 import functools
 import json
 import pathlib
+import re
 
 import jax
 import jax.numpy as jnp
@@ -75,17 +77,18 @@ def test_pictures_of_an_episode(moment: tuple[RobotTask, RobotState]) -> None:
     assert (beside[0][22 : 22 + film.SIDE, -film.SIDE :] == 77).all()
 
 
-def test_the_page_has_everything_inside(
-    moment: tuple[RobotTask, RobotState], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_has_everything_inside(moment: tuple[RobotTask, RobotState], tmp_path: pathlib.Path) -> None:
     env, env_state = moment
     for place in page.MODULES.values():
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / place).write_text(LIBRARY)
-    monkeypatch.setattr(page, "_viewer", lambda: {"viewer": LIBRARY})
     text = page.page(env, [env_state], page.load_scripts(tmp_path))
     assert "http" not in text
-    assert set(json.loads(text.split('importmap">')[1].split("<")[0])["imports"]) == {*page.MODULES, "brax/viewer.js"}
+    imports = json.loads(text.split('importmap">')[1].split("<")[0])["imports"]
+    assert {*page.MODULES, "brax/viewer.js", "brax/system.js"} <= set(imports)
+    for url in (url for name, url in imports.items() if name.startswith("brax/")):
+        script = base64.b64decode(url.removeprefix("data:text/javascript;base64,")).decode()
+        assert set(re.findall(r"^(?:import|export) .*from '([^']+)'", script, re.MULTILINE)) <= set(imports)
     shown = json.loads(text.split('id="system">')[1].split("</script>")[0])
     gripper = shown["geoms"]["gripper"][0]["link_idx"]
     np.testing.assert_allclose(shown["states"]["x"][0]["pos"][gripper], env_state.qpos[:3], atol=1e-6)

@@ -236,7 +236,8 @@ def test_keys_step_through_the_episode(tab: Chromium) -> None:
     assert steps == [1, 2, 1, LENGTH, LENGTH, 0, 0]
     tab.press(" ")
     assert tab.evaluate("document.getElementById('play').getAttribute('aria-label')") == "Pause"
-    tab.evaluate(f"new Promise((done) => setTimeout(done, {450 * 2 + 200}))")
+    tab.evaluate("new Promise((done) => { const wait = () => document.getElementById('position').value >= 2"
+                 " ? done() : setTimeout(wait, 20); wait(); })")
     tab.press(" ")
     assert step_of(tab) >= 2
     tab.evaluate("document.getElementById('position').focus()")  # the slider's own keys do the same

@@ -13,6 +13,7 @@ SCORES = arrays.arrays(np.float64, arrays.array_shapes(min_dims=2, max_dims=2, m
                        elements=st.floats(-100, 100))
 
 
+@hypothesis.settings(deadline=None)
 @hypothesis.given(SCORES)
 def test_interquartile_mean_is_scipys_trimmed_mean(scores):
     np.testing.assert_allclose(statistics.interquartile_mean(scores), scipy.stats.trim_mean(scores, 0.25), atol=1e-9)

@@ -184,9 +184,18 @@ def test_a_job_dies_with_the_process_that_started_it(tmp_path: pathlib.Path):
     parent.send_signal(signal.SIGKILL)
     parent.communicate()
     deadline = time.monotonic() + 30
-    while pathlib.Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+    while is_alive(pid) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not pathlib.Path(f"/proc/{pid}").exists()
+    assert not is_alive(pid)
+
+
+def is_alive(pid: str) -> bool:
+    """Whether a process works, and does not only wait to be collected."""
+    try:
+        status = pathlib.Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return False
+    return status.rpartition(")")[2].split()[0] != "Z"
 
 
 def test_a_job_that_has_no_cores_of_its_own_keeps_to_so_many_threads(tmp_path: pathlib.Path):

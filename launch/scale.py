@@ -51,14 +51,19 @@ def measure(domain: str, strategy: SeedStrategy, devices: int) -> tables.Table:
     return lines
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command."""
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Options of the command."""
     parser = argparse.ArgumentParser(
         prog="python -m launch.scale", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, default=8, help="the most, a power of two (8)")
     parser.add_argument("--domain", default="heaven_hell", help="whose preset (heaven_hell)")
     parser.add_argument("--strategy", default="shard", choices=("shard", "vmap"), help="of the seeds (shard)")
-    options = parser.parse_args(sys.argv[1:] if arguments is None else arguments)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    options = parse(sys.argv[1:] if arguments is None else arguments)
 
     def work() -> None:
         devices = options.devices

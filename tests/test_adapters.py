@@ -158,7 +158,7 @@ def test_gymnasium_bounds_and_time_limits():
     for time in range(3):
         seen, reward, *_ = theirs.step(np.array([2.0], np.float32))
         np.testing.assert_allclose(steps.observation[time, 0], seen, rtol=1e-6)
-        np.testing.assert_allclose(steps.reward[time, 0], reward, rtol=1e-6)
+        np.testing.assert_allclose(steps.reward[time, 0], float(reward), rtol=1e-6)
     np.testing.assert_array_equal(steps.truncated[:, 0], [False, False, True])
 
 

@@ -11,7 +11,7 @@ import pytest
 import tyro
 
 from envs_mjx.robot import camera_files
-from launch import bench, fusion, sweep
+from launch import bench, fusion, scale, sweep
 from launch import paper as experiments
 from mijax import evaluate, export, report, represent, serve, train, transfer
 
@@ -62,7 +62,7 @@ PARSERS: dict[str, Callable[[list[str]], object]] = {
     "mijax.transfer": functools.partial(options_of, transfer.TransferOptions),
     "launch.fusion": functools.partial(options_of, fusion.FusionOptions),
     "envs_mjx.robot.camera_files": camera_files.parse,
-    "launch.paper": experiments.parse, "launch.bench": bench.parse,
+    "launch.paper": experiments.parse, "launch.bench": bench.parse, "launch.scale": scale.parse,
     # imported only here: brax is an extra
     "examples.brax_ppo": lambda words: options_of(importlib.import_module("examples.brax_ppo").PPOOptions, words)}
 

@@ -13,6 +13,7 @@ import sys
 import time
 
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 from tiny_runs import TINY, comparable
 
@@ -154,6 +155,29 @@ def test_a_corrupt_checkpoint_falls_back_to_the_one_before(whole_run: pathlib.Pa
     assert train.main(["--resume", str(path)]) == 0
     assert "corrupt" in capsys.readouterr().out
     assert comparable(path, 0) == comparable(whole_run, 0)
+
+
+def test_a_full_disk_at_a_checkpoint_is_one_line_and_costs_nothing_older(
+    whole_run: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_space(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "full"
+    shutil.copytree(whole_run, path)
+    (path / "summary.json").unlink()
+    for seed in (0, 3):
+        shutil.rmtree(path / f"seed_{seed}" / "checkpoints" / "1200")
+    with monkeypatch.context() as patched:
+        patched.setattr(ocp.CheckpointManager, "save", no_space)
+        assert train.main(["--resume", str(path)]) == 1
+    error = capsys.readouterr().err
+    assert re.search(r"1200: the checkpoint could not be written: .*No space left on device", error)
+    assert len(error.splitlines()) == 1
+    assert train.main(["--resume", str(path)]) == 0
+    for seed in (0, 3):
+        assert comparable(path, seed) == comparable(whole_run, seed)
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])

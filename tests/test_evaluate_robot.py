@@ -6,11 +6,13 @@ import functools
 import json
 import pathlib
 import re
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chromium import PROGRAM, Chromium
 from commands import failure_of
 from PIL import Image
 
@@ -21,6 +23,7 @@ from envs_mjx.robot import film, page
 from envs_mjx.robot.task import RobotState, RobotTask
 from mijax import evaluate, evaluate_robot
 
+VIEWER = pathlib.Path(__file__).resolve().parents[1] / ".cache" / "viewer" / "node_modules"
 LIBRARY = "export const x = 1; // import {y} from './animator.js'"
 
 
@@ -97,6 +100,27 @@ def test_the_page_has_everything_inside(moment: tuple[RobotTask, RobotState], tm
     (tmp_path / page.MODULES["three"]).unlink()
     with pytest.raises(page.ViewerMissing, match="make viewer"):
         page.load_scripts(tmp_path)
+
+
+@pytest.mark.skipif(PROGRAM is None or not VIEWER.is_dir(), reason="needs Chromium and `make viewer`")
+def test_a_browser_draws_the_page(moment: tuple[RobotTask, RobotState], tmp_path: pathlib.Path) -> None:
+    """Without complaint, or asking for more; both objects, in red and in blue, are in sight."""
+    env, env_state = moment
+    (tmp_path / "page.html").write_text(page.page(env, [env_state], page.load_scripts(VIEWER)))
+    browser = Chromium(tmp_path / "profile")
+    browser.resize(800, 600)
+    browser.open(tmp_path / "page.html")
+    red = blue = 0
+    deadline = time.monotonic() + 60
+    while min(red, blue) < 1000 and time.monotonic() < deadline:
+        browser.screenshot(tmp_path / "page.png")
+        with Image.open(tmp_path / "page.png") as image:
+            colours = np.asarray(image.convert("RGB"), np.int32)
+        red, blue = (int((colours[..., one] > colours[..., other] + 40).sum()) for one, other in ((0, 2), (2, 0)))
+    assert min(red, blue) >= 1000
+    assert browser.complaints == []
+    assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
+    browser.close()
 
 
 @pytest.mark.slow

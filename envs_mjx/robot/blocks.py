@@ -37,8 +37,7 @@ class BlockTask(RobotTask):
     placed = ("fixed",)
 
     def xml(self, visual: bool = False) -> str:
-        """Gripper, a loose and a fixed block; `visual` adds nothing."""
-        del visual
+        """Gripper, a loose and a fixed block; `visual` adds the fingers above their tips."""
         block, half = self.block, self.block.side / 2
         middle, size = f'pos="0 0 {block.height / 2}"', f'size="{half} {half} {block.height / 2}"'
         pairs = [scene.pair_xml(f"tip{tip}", name, scene.FINGER_FRICTION) for tip in (0, 1)
@@ -56,7 +55,7 @@ class BlockTask(RobotTask):
             <geom name="loose" type="box" {size} {middle} mass="{block.mass}"/>{cores["loose"]}
           </body>
           <body name="fixed"><geom name="fixed" type="box" {size} {middle}/>{cores["fixed"]}</body>"""
-        return scene.scene_xml(scene.gripper_xml(self.opening.finger, capsules=False), bodies, pairs)
+        return scene.scene_xml(scene.gripper_xml(self.opening.finger, capsules=visual), bodies, pairs)
 
     def joints(self, pose: jax.Array) -> jax.Array:
         """(3,) x, y, yaw."""

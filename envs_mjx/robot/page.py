@@ -81,7 +81,8 @@ def system(env: RobotTask, states: Sequence[RobotState]) -> dict[str, Any]:
             "name": _SHAPES[int(model.geom_type[geom])], "link_idx": body - 1, "rgba": colour,
             "pos": model.geom_pos[geom].tolist(), "rot": model.geom_quat[geom].tolist(),
             "size": model.geom_size[geom].tolist()})
-    geoms["world"] = [_fixed("Plane", [0.0, 0.0, 0.0], [1.0, 1.0, 0.1], [0.8, 0.8, 0.8, 1.0])]
+    centre = np.mean(np.asarray(states[0].poses)[:, :2], axis=0).tolist()
+    geoms["world"] = [_fixed("Plane", [*centre, 0.0], [1.0, 1.0, 0.1], [0.6, 0.6, 0.6, 1.0])]
     if env.has_pad:
         half = window.PAD_SIDE / 2
         geoms["world"].append(_fixed("Box", [*map(float, states[0].goal), 0.0], [half, half, 0.0005], _YELLOW))
@@ -91,7 +92,7 @@ def system(env: RobotTask, states: Sequence[RobotState]) -> dict[str, Any]:
         scene.place(model, env.placed, np.asarray(env.placed_poses(env_state)))
         mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
         moments.append({"pos": data.xpos[1:].tolist(), "rot": data.xquat[1:].tolist()})
-    return {"opt": {"timestep": _STEP_SECONDS}, "geoms": geoms, "states": {"x": moments}}
+    return {"opt": {"timestep": _STEP_SECONDS}, "geoms": geoms, "states": {"x": moments}, "centre": centre}
 
 
 def _fixed(shape: str, place: list[float], size: list[float], colour: list[float]) -> dict[str, Any]:
@@ -127,7 +128,19 @@ _PAGE = """<!DOCTYPE html>
 <script type="application/json" id="system">SYSTEM</script>
 <script type="module">
 import {Viewer} from 'brax/viewer.js';
-new Viewer(document.getElementById('viewer'), JSON.parse(document.getElementById('system').textContent));
+const system = JSON.parse(document.getElementById('system').textContent);
+const viewer = new Viewer(document.getElementById('viewer'), system);
+// brax's view is for scenes of some metres in bright light; this one has half a metre.
+const [x, y] = system.centre;
+viewer.camera.follow = false;
+viewer.camera.near = 0.01;
+viewer.camera.position.set(x + 0.45, y - 0.55, 0.5);
+viewer.camera.updateProjectionMatrix();
+viewer.controls.target.set(x, y, 0.03);
+viewer.scene.traverse((one) => { if (one.isLight) one.intensity *= 0.55; });
+const shade = viewer.dirLight.shadow;
+[shade.camera.left, shade.camera.right, shade.camera.bottom, shade.camera.top] = [-0.5, 0.5, -0.5, 0.5];
+shade.camera.updateProjectionMatrix();
 </script>
 </body>
 </html>

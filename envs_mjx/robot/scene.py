@@ -76,7 +76,7 @@ def gripper_xml(offset: float, capsules: bool) -> str:
     """A body with the joints x, y, z, yaw and two fingers, their centres at `offset` along its x axis to both sides.
 
     A finger is a sphere at its tip, which is all that meets boxes from the side or from above: they are upright, and
-    higher than the tips when these are low. `capsules` adds vertical capsules, to hook lying bars.
+    higher than the tips when these are low. `capsules` adds vertical capsules, to hook lying bars, and to be seen.
     """
     tip = FINGER_RADIUS - FINGER_BELOW
     geoms = []

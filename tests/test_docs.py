@@ -14,12 +14,15 @@ from envs_mjx.robot import camera_files
 from launch import bench, fusion, scale, sweep
 from launch import paper as experiments
 from mijax import evaluate, export, report, represent, serve, train, transfer
+from mijax.config import Config
+from mijax.config import options_of as config_options
 
 ROOT = pathlib.Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "results").rglob("*.md"))]
 NAME = re.compile(r"`((?:mijax|envs_mjx|configs|launch)(?:\.\w+)+)`")
 COMMAND = re.compile(r"python -m ([\w.]+)([^\n`#|;)]*)")
-LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
+LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]+))?\)")
+OPTION = re.compile(r"--(?:no-)?([a-z0-9]+\.(?:no-)?[a-z0-9-]+)")
 
 
 def resolve(name: str) -> object:
@@ -43,8 +46,25 @@ def test_names_links_and_modules_of_commands_exist(page: pathlib.Path):
         resolve(name)
     for module, _ in COMMAND.findall(text):
         assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
-    for link in LINK.findall(text):
-        assert (page.parent / link).exists(), link
+    for link, anchor in LINK.findall(text):
+        target = page.parent / link if link else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in headings_of(target / "README.md" if target.is_dir() else target), f"{link}#{anchor}"
+
+
+def headings_of(page: pathlib.Path) -> set[str]:
+    """As links name them."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "results" not in page.parts],
+                         ids=lambda page: str(page.relative_to(ROOT)))
+def test_options_in_the_text_exist(page: pathlib.Path):
+    known = {name.replace("_", "-") for name in config_options(Config())}
+    for option in OPTION.findall(page.read_text(encoding="utf-8")):
+        assert option.replace(".no-", ".") in known, option
 
 
 def options_of(kind: type, words: list[str]) -> object:

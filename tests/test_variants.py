@@ -188,6 +188,8 @@ def test_believer_learns_its_features_with_its_own_penalty():
     assert stage1.lambda_kl > 0
     assert stage1.lambda_club == stage1.lambda_dim_s == stage1.lambda_dim_o == stage1.phi_shrinkage == 0
     assert stage1_of(CONFIG) == CONFIG.stage1
+    asked = dataclasses.replace(CONFIG.stage1, lower_bound="variables", lambda_dim_o=0.7)
+    assert stage1_of(dataclasses.replace(CONFIG, agent="believer", stage1=asked)).lambda_dim_o == 0.7
 
 
 def test_states_that_do_not_fit_beside_observations_are_refused():

@@ -66,7 +66,7 @@ def drawable(env: Environment) -> GridWorld:
     """
     if not isinstance(env, GridWorld):
         raise NoDrawing(f"environment {env.name!r} cannot be drawn, as grid worlds (envs_mjx.grid.world) and robot "
-                        "tasks can; for any other: python -m mijax.report RUN --episode")
+                        "tasks can; for any other: python -m mijax.report RUN --html")
     return env
 
 

@@ -14,7 +14,8 @@ STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000} | d
 """10 000, 20 000 and 800 episodes of 50 steps."""
 EPOCHS = 1000
 TABLE_3 = {"sphinx": {"learning_rate": 1e-3},
-           "carflag_2d": {"learning_rate": 1e-3, "episodes": 1000, "lambda_r": 1.0},
+           "carflag_2d": {"learning_rate": 1e-3, "lambda_r": 1.0, "lambda_o": 5.0, "lambda_club": 10.0,
+                          "lambda_dim_s": 0.0},
            "block_pulling": {"learning_rate": 1e-3, "batch_size": 500, "lambda_r": 10.0, "lambda_s": 0.1,
                              "lambda_club": 10.0, "lambda_dim_s": 0.1},
            "block_pushing": {"learning_rate": 1e-3, "batch_size": 500, "lambda_r": 100.0, "lambda_s": 1.0,
@@ -35,7 +36,7 @@ def paper(config: Config, vector_observation: bool) -> Config:
     dqn = dataclasses.replace(
         config.dqn, learning_rate=CRITIC_LEARNING_RATE.get(domain, 3e-4), final_learning_rate=1.0, discount=0.99,
         trace_decay=0.0, target_rate=0.005, batch_episodes=64, updates_per_step=0.25, warmup_episodes=10,
-        epsilon_steps=steps // 10, value_bound=0.0)
+        epsilon_steps=steps // 10, value_bound=0.0, pretrain_updates=0)
     sac = dataclasses.replace(
         config.sac, learning_rate=3e-4, final_learning_rate=1.0, discount=0.99, trace_decay=0.0, target_rate=0.005,
         batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0,
@@ -46,6 +47,7 @@ def paper(config: Config, vector_observation: bool) -> Config:
         intrinsic_form="cosine")
     stage1 = dataclasses.replace(
         config.stage1, epochs=EPOCHS, rewarded=0, club_ramp=0.0, warmup=0.0, phi_shrinkage=0.0,
-        lower_bound="jensen_shannon", **TABLE_3.get(domain, {}))
+        lower_bound="jensen_shannon", state_bound="jensen_shannon", estimator_view="features",
+        **TABLE_3.get(domain, {}))
     return dataclasses.replace(config, steps=steps, network=network, dqn=dqn, sac=sac, information=information,
                                stage1=stage1)

@@ -258,7 +258,7 @@ def bench_seeds(bench: Bench, env: Environment) -> Iterator[Result]:
     one = 0.0
     for count in (1, bench.sizes.seeds):
         config = configs.preset(env.name)
-        dqn = dataclasses.replace(config.dqn, replay_steps=100_000, warmup_episodes=config.num_envs)
+        dqn = dataclasses.replace(config.dqn, replay_steps=100_000, warmup_episodes=config.num_envs, pretrain_updates=0)
         evaluation = dataclasses.replace(config.evaluation, every=bench.sizes.chunk_steps)
         config = dataclasses.replace(config, dqn=dqn, evaluation=evaluation)
         representation = fresh_learner(env, config, bench.sizes)[2]
@@ -322,7 +322,8 @@ def fresh_learner(env: Environment, config: Config, sizes: Sizes) -> tuple[Learn
         encoder_for(spec, features).init(jax.random.key(0), jnp.zeros((1, *spec.shape), spec.dtype))["params"]
         for spec in (env.state_spec, env.observation_spec)
     )
-    representation = Representation(phi=phi, psi=psi, z_s_mean=jnp.zeros((features,)), z_s_variance=jnp.ones(()))
+    representation = Representation(phi=phi, psi=psi, z_s_mean=jnp.zeros((features,)), z_s_variance=jnp.ones(()),
+                                    data_key=jnp.zeros((2,), jnp.uint32))
     return learner, learner.agent.init(jax.random.key(1), representation), representation
 
 

@@ -14,6 +14,8 @@ CriticInput = Literal["state", "history_state"]
 PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
 IntrinsicForm = Literal["explained_variance", "cosine"]
 LowerBound = Literal["jensen_shannon", "variables"]
+StateBound = Literal["jensen_shannon", "conditional"]
+EstimatorView = Literal["features", "directions"]
 DataSource = Literal["random", "demonstrations"]
 """Whose episodes stage 1 learns from: a random policy's, or those of the environment's expert."""
 TrunkKind = Literal["own", "shared", "psi", "z_o"]
@@ -79,6 +81,10 @@ class Stage1Config:
     constant. At its full weight from the start, CLUB on camera images stops all learning before it has begun."""
     lambda_dim_s: float = 0.0
     """Weight of the lower bound of I(s; z_s), which is maximised."""
+    state_bound: StateBound = "jensen_shannon"
+    """Which bound that is. jensen_shannon: Deep InfoMax, the paper's, which asks that states are told apart.
+    conditional: of I(s; z_s | o), which asks only that states are told apart which show the same observation: for what
+    is hidden, and for nothing that can be seen. For domains whose observations repeat within a batch."""
     lambda_dim_o: float = 1.0
     """Weight of the lower bound of I(o; z_o), which is maximised."""
     lower_bound: LowerBound = "jensen_shannon"
@@ -88,6 +94,10 @@ class Stage1Config:
     simulator knows as numbers in training."""
     estimator_updates: int = 5
     """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
+    estimator_view: EstimatorView = "features"
+    """How q sees z_s. features: each brought to variance 1 (ours; the paper: as they are). directions: each principal
+    direction of a batch is, so that what leaks into directions of little variance is seen as well, down to a
+    ten-thousandth of the whole."""
     lambda_kl: float = 0.0
     """Weight of Believer's penalty KL[N(phi(s), 1) || N(0, 1)]; above 0, training draws z_s from that Gaussian."""
     rewarded: int = 0
@@ -178,7 +188,13 @@ class DQNConfig:
     replay_steps: int = 1_000_000
     """Capacity of the replay, in steps of full-length episodes."""
     warmup_episodes: int = 40
-    """Random episodes before the first update (paper's program: 10)."""
+    """Random episodes before the first update (paper's program: 10). None where the replay starts with
+    those of stage 1."""
+    pretrain_updates: int = 0
+    """Updates on the random episodes that stage 1 learnt from, before the agent acts: its replay then starts with them,
+    as they were paid for. For agents with a stage 1 of random episodes alone. 0: the replay starts empty (paper)."""
+    pretrained_epsilon: float = 0.4
+    """Where in its schedule exploration starts after such updates."""
     epsilon_final: float = 0.02
     """Exploration at the end of its schedule (the paper's 1 / horizon)."""
     epsilon_steps: int = 25_000
@@ -191,11 +207,12 @@ class DQNConfig:
 
     def __post_init__(self) -> None:
         _require_at_least("dqn.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes", "epsilon_steps")
-        _require_at_least("dqn.", self, 0, "value_bound")
+        _require_at_least("dqn.", self, 0, "value_bound", "pretrain_updates")
         require(self.learning_rate > 0, "dqn.learning-rate", self.learning_rate, "a number > 0")
         require(self.updates_per_step > 0, "dqn.updates-per-step", self.updates_per_step, "a number > 0")
         require(self.batch_episodes % 2 == 0, "dqn.batch-episodes", self.batch_episodes, "an even number")
-        for name in ("discount", "trace_decay", "target_rate", "epsilon_final", "final_learning_rate"):
+        for name in ("discount", "trace_decay", "target_rate", "epsilon_final", "final_learning_rate",
+                     "pretrained_epsilon"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"dqn.{name}".replace("_", "-"), value, "a number in [0, 1]")
 

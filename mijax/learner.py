@@ -27,6 +27,7 @@ from mijax.nets.actor_critic import shown
 from mijax.nets.encoders import encoder_for
 from mijax.packing import Layout, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, StepRecord, fill, init_replay, returns_of, sample_episodes, write
+from mijax.representation.dataset import random_episodes
 from mijax.rollout import (
     Actor,
     Episodes,
@@ -69,7 +70,7 @@ class Learner:
     pack: bool = True  # choose the number of packed rows at run time; a branch that `vmap` would turn into all of them
 
     def init(self, key: jax.Array, representation: Representation | None) -> LearnerState:
-        """Fresh networks, and a replay of demonstrations, where there are any, and of random episodes."""
+        """Fresh networks, and a replay of demonstrations, of stage 1's random episodes, or of new ones."""
         key_agent, key_start, key_warmup, key_run = jax.random.split(key, 4)
         num_envs = self.config.num_envs
         episodes = start_episodes(self.env, self.agent, num_envs, key_start, self.agent.copies > 0)
@@ -78,6 +79,8 @@ class Learner:
         replay = init_replay(first, capacity, self.env.horizon, kept=self.demonstrations)
         if self.demonstrations:
             replay = self._demonstrate(replay, representation, jax.random.fold_in(key, 4))
+        if self.remembers:
+            replay = self._remember(replay, representation)
         state = LearnerState(
             agent=self.agent.init(key_agent, representation),
             representation=representation,
@@ -88,6 +91,8 @@ class Learner:
         )
         if self.agent.declaration.believes:
             state = dataclasses.replace(state, agent=self._believe(state, jax.random.fold_in(key, 5)))
+        if not self.warmup_steps:
+            return state
         return self._collect(state, jnp.ones(()), jax.random.split(key_warmup, self.warmup_steps // num_envs))[0]
 
     def _first(self, representation: Representation | None, episodes: Episodes) -> StepRecord:
@@ -101,26 +106,44 @@ class Learner:
         key_episodes, key_symmetry = jax.random.split(key)
         shown = self.env.demonstrations(key_episodes, self.demonstrations)
         assert shown is not None
-        record, none = self.recorder(representation), self.agent.no_action(1)
-        symmetries = draw_symmetry(key_symmetry, self.demonstrations)
-
-        def store(episode: tuple) -> StepRecord:
-            env_state, *actions, symmetry = episode
-            previous, intended = (jnp.concatenate([none, action.astype(none.dtype)]) for action in actions)
-            symmetry = jnp.broadcast_to(symmetry[None], (previous.shape[0], 2)) if self.agent.copies else None
-            return jax.lax.map(one, (env_state, previous, symmetry, intended), batch_size=MOMENTS_AT_ONCE)
-
-        def one(moment: tuple) -> StepRecord:
-            env_state, previous, symmetry, intended = jax.tree.map(lambda x: x[None], moment)
-            recorded = record(jax.vmap(self.env.show)(env_state), previous, env_state, symmetry, intended)
-            return jax.tree.map(lambda x: x[0], recorded)
-
         intended = shown.action if shown.intended is None else shown.intended
-        records = jax.lax.map(store, (shown.env_state, shown.action, intended, symmetries))
+        records = self._record_episodes(representation, key_symmetry, shown.env_state, None, shown.action, intended)
         order = jnp.argsort(~shown.success, stable=True)
         order = order[jnp.arange(self.demonstrations) % jnp.maximum(jnp.sum(shown.success), 1)]
         records, length = jax.tree.map(lambda x: x[order], (records, shown.length))
         return fill(replay, records, jnp.where(jnp.any(shown.success), length + 1, 0))
+
+    def _remember(self, replay: Replay, representation: Representation | None) -> Replay:
+        """The replay with the random episodes that stage 1 learnt from."""
+        assert representation is not None
+        key = jax.random.wrap_key_data(representation.data_key)
+        episodes = random_episodes(self.env, key, self.config.stage1.episodes)
+        kept = min(self.config.stage1.episodes, replay.capacity)
+        episodes = jax.tree.map(lambda x: x[:kept], episodes)
+        records = self._record_episodes(
+            representation, key, episodes.env_state, episodes.timestep, episodes.action, episodes.action)
+        return fill(replay, records, episodes.length + 1)
+
+    def _record_episodes(
+        self, representation: Representation | None, key: jax.Array, env_state: EnvState, timestep: TimeStep | None,
+        action: jax.Array, intended: jax.Array
+    ) -> StepRecord:
+        """What the replay stores of N whole episodes, (N, T + 1, ...), from their N T actions, those that were meant,
+        and their moments; `timestep`: what these showed, None where they are to be shown again."""
+        record, none = self.recorder(representation), self.agent.no_action(1)
+
+        def store(episode: tuple) -> StepRecord:
+            env_state, timestep, *actions, symmetry = episode
+            previous, intended = (jnp.concatenate([none, action.astype(none.dtype)]) for action in actions)
+            symmetry = jnp.broadcast_to(symmetry[None], (previous.shape[0], 2)) if self.agent.copies else None
+            return jax.lax.map(one, (env_state, timestep, previous, symmetry, intended), batch_size=MOMENTS_AT_ONCE)
+
+        def one(moment: tuple) -> StepRecord:
+            env_state, timestep, previous, symmetry, intended = jax.tree.map(lambda x: x[None], moment)
+            shown = jax.vmap(self.env.show)(env_state) if timestep is None else timestep
+            return jax.tree.map(lambda x: x[0], record(shown, previous, env_state, symmetry, intended))
+
+        return jax.lax.map(store, (env_state, timestep, action, intended, draw_symmetry(key, action.shape[0])))
 
     def has_demonstrations(self, state: LearnerState) -> bool:
         """Whether those that a fresh state should have in its replay are there."""
@@ -130,33 +153,29 @@ class Learner:
     def _believe(self, state: LearnerState, key: jax.Array) -> AgentState:
         """Fit Believer's history VAE (paper Appendix A.5, Stage 2) to what stage 1 learns from, as the paper's agents
         have the same data (5.1): the demonstrations, or as many random episodes."""
-        key_start, key_collect, key_update = jax.random.split(key, 3)
+        replay = state.replay
         demonstrated = self.demonstrations > 0 and self.config.stage1.data == "demonstrations"
-        replay = state.replay if demonstrated else self._random_replay(state, key_start, key_collect)
+        if not (demonstrated or self.remembers):
+            replay = self._remember(jax.tree.map(jnp.zeros_like, replay), state.representation)
 
         def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, None]:
             return self.update(agent, replay, state.representation, key, pretrain=True)[0], None
 
-        agent, _ = jax.lax.scan(update, state.agent, jax.random.split(key_update, self.config.believer.updates))
+        agent, _ = jax.lax.scan(update, state.agent, jax.random.split(key, self.config.believer.updates))
         return dataclasses.replace(agent, optimizer=self.agent.optimizer.init(agent.params))
-
-    def _random_replay(self, state: LearnerState, key_start: jax.Array, key_collect: jax.Array) -> Replay:
-        """As many episodes of random actions as stage 1 has, in a replay of their own."""
-        num_envs = self.config.num_envs
-        open_episodes = start_episodes(self.env, self.agent, num_envs, key_start, self.agent.copies > 0)
-        first = self._first(state.representation, open_episodes)
-        replay = init_replay(first, max(self.config.stage1.episodes, num_envs), self.env.horizon)
-        random = dataclasses.replace(
-            state, episodes=open_episodes, replay=write(replay, first, open_episodes.position))
-        rounds = -(-self.config.stage1.episodes // num_envs)
-        keys = jax.random.split(key_collect, rounds * self.env.horizon)
-        return self._collect(random, jnp.ones(()), keys)[0].replay
 
     @property
     def warmup_steps(self) -> int:
         """Random environment steps before the first update: at least `warmup_episodes` full-length episodes."""
+        if self.remembers:
+            return 0
         rounds = -(-self.agent.options.warmup_episodes // self.config.num_envs)
         return rounds * self.config.num_envs * self.env.horizon
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the replay starts with the random episodes of stage 1."""
+        return self.agent.group == "dqn" and self.agent.pretrain_updates > 0
 
     @property
     def demonstrations(self) -> int:
@@ -175,8 +194,8 @@ class Learner:
 
     @property
     def pretrain_iterations(self) -> int:
-        """Iterations of updates alone, before the first step: as many as hold `--sac.pretrain-updates`."""
-        return -(-self.config.sac.pretrain_updates // self.updates_per_iteration) if self.demonstrations else 0
+        """Iterations of updates alone, before the first step: as many as hold the agent's `pretrain_updates`."""
+        return -(-self.agent.pretrain_updates // self.updates_per_iteration)
 
     @property
     def iterations_per_chunk(self) -> int:

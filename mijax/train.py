@@ -22,7 +22,7 @@ from envs_mjx.contract import check_contract
 from envs_mjx.errors import UserError
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
-from mijax.agents.variants import memory_of, needs_representation, stage1_of, title_of, unread_groups
+from mijax.agents.variants import memory_of, needs_representation, pretrains, stage1_of, title_of, unread_groups
 from mijax.config import Config, Stage1Config, config_from_dict, options_of, parse_seeds, require
 from mijax.hosts import Host, check, meet
 from mijax.learner import Learner, make_learner
@@ -115,11 +115,15 @@ def unread_options(config: Config, env: Environment) -> list[str]:
             and all(preset[name] != value for preset in presets)]
 
 
-def _require_kind(source: RunFolder, wanted: Stage1Config) -> None:
-    """Raise `ConfigError` unless another run's features are of the kind that an agent is about: Believer's or ours."""
+def _require_kind(source: RunFolder, wanted: Stage1Config, pretrains: bool) -> None:
+    """Raise `ConfigError` unless another run's features are of the kind that an agent is about, Believer's or ours, and
+    for one that `pretrains`, of as many episodes as it takes them to be."""
     stored = source.config()
     read = config_from_dict({name: stored[name] for name in ("agent", "stage1") if name in stored})
     other = stage1_of(read) if "agent" in stored else read.stage1
+    require(not pretrains or (other.data, other.episodes) == (wanted.data, wanted.episodes), "stage1.episodes",
+            f"{wanted.episodes} ({wanted.data})",
+            f"{other.episodes} ({other.data}), as {source.path} has, whose episodes the replay starts with")
     kinds = {True: "Believer's (a KL penalty)", False: "ours (CLUB)"}
     require((other.lambda_kl > 0) == (wanted.lambda_kl > 0), "representation", str(source.path),
             f"a run with features of the other kind: {kinds[wanted.lambda_kl > 0]}")
@@ -202,7 +206,7 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
         require(needs_representation(config), "representation", options.representation,
                 f"none: --agent {config.agent} looks through no features here")
         source = RunFolder.open(options.representation)
-        _require_kind(source, stage1_of(config))
+        _require_kind(source, stage1_of(config), pretrains(config))
         fill = stage1.reuse(source, env, config.stage1.features, every_seed)
     unread = unread_options(config, env)
     if unread:
@@ -292,11 +296,14 @@ def _start(
 def _prelude(learner: Learner) -> str:
     """What comes before the first update, which on a robot takes a minute or two."""
     config, parts = learner.config, []
+    if learner.remembers:
+        parts.append(f"{config.stage1.episodes:,} random episodes of stage 1")
     if learner.demonstrations:
         parts.append(f"{learner.demonstrations} demonstrations")
     if learner.agent.declaration.believes:
         parts.append(f"{config.believer.updates:,} updates of the history model")
-    parts.append(f"{learner.warmup_steps:,} random steps")
+    if learner.warmup_steps:
+        parts.append(f"{learner.warmup_steps:,} random steps")
     return ", ".join(parts)
 
 

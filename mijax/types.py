@@ -24,6 +24,7 @@ class Representation:
     psi: Params  # observation encoder, o -> z_o
     z_s_mean: jax.Array  # (F,)  mean of z_s over the training set
     z_s_variance: jax.Array  # ()  Tr Var(z_s) over the training set: the unit of the bonus and of the auxiliary loss
+    data_key: jax.Array  # (2,) uint32  data of the key that the episodes it was learnt from follow from
 
     def standardise(self, z_s: jax.Array) -> jax.Array:
         """(..., F) features -> (..., F) with mean 0 and total variance 1."""

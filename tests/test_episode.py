@@ -132,7 +132,8 @@ def test_continuous_actions_are_traced() -> None:
     learner = make_learner(Compass(), CONFIG)
     shapes = [jnp.zeros((1, *spec.shape)) for spec in (learner.env.state_spec, learner.env.observation_spec)]
     encoders = init_parameters(networks_for(learner.env, STAGE1.features), jax.random.key(5), *shapes)
-    representation = Representation(encoders["phi"], encoders["psi"], jnp.zeros(STAGE1.features), jnp.float32(1))
+    representation = Representation(encoders["phi"], encoders["psi"], jnp.zeros(STAGE1.features), jnp.float32(1),
+                                    jnp.zeros(2, jnp.uint32))
     agent = jax.jit(learner.agent.init)(training_key(0), representation)
     unused: Any = None
     state = LearnerState(agent, representation, unused, unused, unused, unused)

@@ -22,6 +22,7 @@ from mijax.config import (
     Stage1Config,
 )
 from mijax.learner import Learner, LearnerState, make_learner
+from mijax.representation.dataset import collect
 from mijax.representation.model import networks_for
 from mijax.types import Metrics, Representation
 
@@ -284,12 +285,52 @@ def test_recall_cannot_be_solved_without_memory():
         assert equal(*seen)
 
 
+def test_the_replay_of_ours_starts_with_the_episodes_that_stage_1_learnt_from():
+    config = dataclasses.replace(
+        CONFIG, dqn=dataclasses.replace(CONFIG.dqn, pretrain_updates=8),
+        stage1=Stage1Config(features=FEATURES, episodes=9))
+    run = Run(Recall(), config)
+    assert run.representation is not None
+    key = jax.random.key(5)
+    run.representation = dataclasses.replace(run.representation, data_key=jax.random.key_data(key))
+    state, data = run.start(), collect(Recall(), key, 9)
+    assert run.learner.warmup_steps == 0
+    assert int(state.iteration) == -run.learner.pretrain_iterations == -2  # 6 updates in an iteration
+    assert int(state.replay.count) == 9
+    transitions = 0
+    for number, slot in enumerate(np.asarray(state.replay.finished[:9])):
+        steps, rows = int(state.replay.length[slot]) - 1, np.flatnonzero(np.asarray(data.episode) == number)
+        stored = jax.tree.map(lambda x, slot=slot: np.asarray(x[slot]), state.replay.data)
+        assert steps == len(rows)
+        np.testing.assert_array_equal(stored.observation[:steps], data.observations[data.observation[rows]])
+        np.testing.assert_array_equal(stored.observation[1 : steps + 1], data.observations[data.next_observation[rows]])
+        np.testing.assert_array_equal(stored.previous_action[: steps + 1], [-1, *data.action[rows]])
+        np.testing.assert_array_equal(stored.reward[: steps + 1], [0, *data.reward[rows]])
+        np.testing.assert_array_equal(stored.terminated[1 : steps + 1], data.terminal[rows])
+        z_s: Any = networks_for(Recall(), FEATURES).phi.apply(
+            {"params": run.representation.phi}, data.states[data.state[rows]])
+        np.testing.assert_allclose(stored.z_s[:steps], z_s, rtol=1e-5)
+        transitions += steps
+    assert transitions == data.size
+    assert run.learner.epsilon(jnp.int32(0)) == pytest.approx(config.dqn.pretrained_epsilon)
+    assert run.learner.epsilon(jnp.int32(10**6)) == pytest.approx(config.dqn.epsilon_final)
+
+
+def test_who_has_no_stage_1_starts_with_random_episodes(base):
+    assert BASE.dqn.pretrain_updates == 0
+    eager = dataclasses.replace(BASE, dqn=dataclasses.replace(BASE.dqn, pretrain_updates=8))
+    learner = make_learner(Recall(), eager)
+    assert learner.pretrain_iterations == 0
+    assert learner.warmup_steps == base[0].learner.warmup_steps > 0
+    assert learner.epsilon(jnp.int32(0)) == 1
+
+
 LEARNING = dataclasses.replace(
     CONFIG, num_envs=8, steps_per_iteration=4, steps=3200,
     network=NetworkConfig(action_embedding=8, observation_embedding=8, gru_width=16, critic_hidden=(32,),
                           auxiliary_hidden=(32,)),
     dqn=DQNConfig(batch_episodes=16, updates_per_step=0.25, learning_rate=3e-3, target_rate=0.02, epsilon_steps=1000,
-                  replay_steps=20_000),
+                  replay_steps=20_000, pretrain_updates=200),
     evaluation=EvaluationConfig(every=3200), believer=BelieverConfig(samples=4, updates=300),
 )
 

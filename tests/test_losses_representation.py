@@ -90,6 +90,20 @@ def test_dim_with_identical_inputs_averages_each_row_over_its_own_pairs():
     np.testing.assert_allclose(dim_jensen_shannon(jnp.asarray(scores), identical)[0], np.mean(rows), rtol=1e-5)
 
 
+def test_dim_with_chosen_negatives_averages_each_row_over_those():
+    scores, state, shown = _random(6, 6), np.array([0, 1, 0, 2, 2, 3]), np.array([0, 0, 0, 1, 1, 2])
+    softplus = lambda x: np.log1p(np.exp(x))  # noqa: E731
+    rows = []
+    for i in range(6):
+        others = scores[i, (state != state[i]) & (shown == shown[i])]
+        pushed = np.mean(softplus(others)) if others.size else 0.0
+        rows.append(np.mean(softplus(-scores[i, state == state[i]])) + pushed)
+    same = jnp.asarray(state[:, None] == state[None, :])
+    alike = jnp.asarray(shown[:, None] == shown[None, :])
+    loss = dim_jensen_shannon(jnp.asarray(scores), same, different=~same & alike)[0]
+    np.testing.assert_allclose(loss, np.mean(rows), rtol=1e-5)
+
+
 def test_dim_reaches_its_known_optimum_and_not_more():
     """K equally likely inputs, told apart: the best score is log K for equal inputs, minus infinity elsewhere."""
     k = 4

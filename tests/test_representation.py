@@ -27,11 +27,13 @@ from mijax.representation.train import (
     EstimatorState,
     LossWeights,
     club_growth,
+    dim_loss,
     encode,
     encoder_loss,
     initial_state,
     optimizers,
     shrink,
+    standardize_directions,
 )
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
@@ -212,6 +214,34 @@ def test_each_term_teaches_the_networks_it_is_about(env, weight, reached):
     _, gradients = objective(env, dataclasses.replace(SMALL, **WEIGHTS), alone)
     taught = {name for name, part in gradients.items() if any(np.any(leaf) for leaf in jax.tree.leaves(part))}
     assert taught == reached
+
+
+@pytest.mark.lenient
+def test_the_conditional_bound_asks_for_what_is_hidden_alone(env):
+    """On Heaven-Hell: two states that show the same differ in the side; z_s that tells it has nothing left to gain."""
+    config = dataclasses.replace(SMALL, **WEIGHTS, state_bound="conditional")
+    problem = Problem.of(env, config, collect(env, jax.random.key(0), config.episodes))
+    rows = problem.batch(jnp.arange(config.batch_size), jax.random.key(2)).rows
+    states, observations = problem.data.states[rows.state], problem.data.observations[rows.observation]
+    side = 50.0 * states[:, 2:]
+    weight = jnp.full(rows.size, 1 / rows.size)
+    assert float(dim_loss(side, side, rows.state, weight, rows.observation)) < 1e-3
+    assert float(dim_loss(side, side, rows.state, weight)) > 1.0  # states that differ in place are negatives there
+    assert len(np.unique(np.asarray(observations), axis=0)) < len(np.unique(np.asarray(states), axis=0))
+    terms, _ = objective(env, config, LossWeights.of(config))
+    plain, _ = objective(env, dataclasses.replace(config, state_bound="jensen_shannon"), LossWeights.of(config))
+    assert terms["dim_s_loss"] != plain["dim_s_loss"]
+
+
+def test_directions_of_little_variance_are_seen_as_well():
+    generator = np.random.default_rng(0)
+    mixed = generator.normal(size=(4000, 3)) * [1.0, 0.05, 1e-4] @ np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    weight = jnp.full(4000, 1 / 4000)
+    seen = np.asarray(standardize_directions(jnp.asarray(mixed, jnp.float32), weight))
+    variance = np.linalg.eigvalsh(np.cov(seen.T))
+    np.testing.assert_allclose(variance[1:], [0.96, 1.0], atol=0.02)  # 0.05 squared beside the floor of 1e-4
+    assert variance[0] < 1e-3
+    np.testing.assert_allclose(seen.mean(0), 0, atol=1e-4)
 
 
 @pytest.mark.lenient

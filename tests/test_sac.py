@@ -321,7 +321,7 @@ def test_the_value_of_a_beginning(name: str):
 @pytest.mark.lenient
 def test_the_step_size_falls_over_all_updates():
     options = SACConfig(learning_rate=0.1, final_learning_rate=0.2, updates_per_step=0.5)
-    optimizer = adam(dataclasses.replace(CONFIG, steps=20), options)  # 10 updates
+    optimizer = adam(options, options.updates_in(20))  # 10 updates
     params, moves = jnp.zeros(()), []
     state = optimizer.init(params)
     for _ in range(12):

@@ -269,6 +269,7 @@ def test_a_representation_of_another_domain_is_refused(whole_run: pathlib.Path, 
     (["--resume", "RUN", "other"], "--resume: got 'other'"),
     (["--agent", "base", "--representation", "RUN"], "--agent base looks through no features here"),
     (["--stage1.features", "16", "--representation", "RUN"], "holds features 32 wide, wanted --stage1.features 16"),
+    (["--dqn.pretrain-updates", "9", "--representation", "RUN"], "--stage1.episodes: got '500 (random)', accepted: 12"),
 ])
 def test_what_does_not_go_with_a_run_is_refused(
     whole_run: pathlib.Path, arguments: list[str], named: str, tmp_path: pathlib.Path,

@@ -48,7 +48,8 @@ def with_representation(run: RunFolder, env: Environment) -> RunFolder:
     zeros = [jnp.zeros((1, *spec.shape), spec.dtype) for spec in (env.state_spec, env.observation_spec)]
     features = Config().stage1.features
     parameters = init_parameters(networks_for(env, features), jax.random.key(0), *zeros)
-    representation = Representation(parameters["phi"], parameters["psi"], jnp.zeros(features), jnp.ones(()))
+    representation = Representation(parameters["phi"], parameters["psi"], jnp.zeros(features), jnp.ones(()),
+                                    jnp.zeros(2, jnp.uint32))
     save_representation(representation, env, stage1.folder_of(run, 0))
     return run
 

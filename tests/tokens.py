@@ -48,7 +48,8 @@ def representation(env: Environment, seed: int = 5) -> Representation:
     """Untrained encoders, a mean that is not 0 and a variance that is not 1."""
     zeros = [jnp.zeros((1, *spec.shape)) for spec in (env.state_spec, env.observation_spec)]
     parameters = init_parameters(networks_for(env, FEATURES), jax.random.key(seed), *zeros)
-    return Representation(parameters["phi"], parameters["psi"], jnp.arange(FEATURES, dtype=jnp.float32), jnp.float32(2))
+    return Representation(parameters["phi"], parameters["psi"], jnp.arange(FEATURES, dtype=jnp.float32), jnp.float32(2),
+                          jnp.zeros(2, jnp.uint32))
 
 
 def episodes(action_spec: ActionSpec) -> Tokens:

@@ -80,6 +80,11 @@ class Agent(abc.ABC):
         """Copies of each episode, moved by a symmetry of the task, that are sampled beside the original."""
 
     @property
+    @abc.abstractmethod
+    def pretrain_updates(self) -> int:
+        """Updates before the agent acts."""
+
+    @property
     def looks_once(self) -> bool:
         """Whether what the agent sees of a frame never changes, so that the replay stores that."""
         return False
@@ -308,8 +313,8 @@ def episode_mean(x: jax.Array, valid: jax.Array, tokens: Tokens) -> jax.Array:
     return jnp.sum(jnp.where(valid, x, 0)) / jnp.maximum(episodes, 1)
 
 
-def adam(config: Config, options: DQNConfig | SACConfig) -> optax.GradientTransformation:
-    """Adam, whose step size falls linearly over the run."""
+def adam(options: DQNConfig | SACConfig, updates: int) -> optax.GradientTransformation:
+    """Adam, whose step size falls linearly over the updates of a run."""
     rate = optax.linear_schedule(
-        options.learning_rate, options.learning_rate * options.final_learning_rate, options.updates_in(config.steps))
+        options.learning_rate, options.learning_rate * options.final_learning_rate, updates)
     return optax.adam(rate)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from envs_mjx.base import DiscreteActions, Environment
 from mijax.agents.core import Agent, AgentState, Heads, adam, episode_mean, may_follow, transitions
-from mijax.agents.variants import Variant, memory_of, variant
+from mijax.agents.variants import Variant, memory_of, pretrains, variant
 from mijax.config import Config, ConfigError, DQNConfig
 from mijax.losses import td
 from mijax.losses.returns import traced_returns
@@ -42,6 +42,11 @@ class DQN(Agent):
         """None."""
         return 0
 
+    @property
+    def pretrain_updates(self) -> int:
+        """On the random episodes of stage 1, where the agent has any."""
+        return self.options.pretrain_updates if pretrains(self.config) else 0
+
     def init_network(self, key: jax.Array) -> Params:
         """Fresh parameters of the network."""
         return self.network.init(key, self.example_tokens())["params"]
@@ -56,9 +61,11 @@ class DQN(Agent):
         return agent
 
     def epsilon(self, environment_steps: jax.Array) -> jax.Array:
-        """() falls linearly."""
-        progress = jnp.minimum(environment_steps / self.options.epsilon_steps, 1)
-        return 1 + (self.options.epsilon_final - 1) * progress
+        """() falls linearly; after updates on the episodes of stage 1 from the middle of its schedule on."""
+        final = self.options.epsilon_final
+        begun = (1 - self.options.pretrained_epsilon) / ((1 - final) or 1.0) if self.pretrain_updates else 0.0
+        progress = jnp.minimum(environment_steps / self.options.epsilon_steps + begun, 1)
+        return 1 + (final - 1) * progress
 
     def act(
         self, params: Params, memory: MemoryState, observation: jax.Array, previous_action: jax.Array
@@ -178,7 +185,8 @@ def make_dqn(env: Environment, config: Config) -> DQN:
         raise ConfigError(f"--domain: {env.name} has continuous actions, accepted by this agent: discrete actions")
     declaration = variant(config.agent)
     network = _network(env, config, declaration)
+    updates = config.dqn.updates_in(config.steps) + (config.dqn.pretrain_updates if pretrains(config) else 0)
     information_model = None
     if declaration.informed and config.information.intrinsic_weight > 0:
         information_model = InformationModel(cast(TwoBranchQ, network).top.clone(), config.stage1.features)
-    return DQN(env, config, declaration, network, information_model, adam(config, config.dqn))
+    return DQN(env, config, declaration, network, information_model, adam(config.dqn, updates))

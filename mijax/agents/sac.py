@@ -50,6 +50,11 @@ class SAC(Agent):
         return self.options.rotated_copies
 
     @property
+    def pretrain_updates(self) -> int:
+        """On the demonstrations, where there are any."""
+        return self.options.pretrain_updates if self.options.demonstrations else 0
+
+    @property
     def looks_once(self) -> bool:
         """Where psi, or its body, is the trunk and stays as it is."""
         return self.options.looks_through_psi and not self.declaration.sees_state
@@ -309,4 +314,4 @@ def make_sac(env: Environment, config: Config) -> SAC:
     network, model = _network(env, config, declaration), None
     if declaration.informed and config.information.intrinsic_weight > 0:
         model = InformationModel(cast(TwoBranchActorCritic, network).actor.top.clone(), config.stage1.features)
-    return SAC(env, config, declaration, network, model, adam(config, config.sac))
+    return SAC(env, config, declaration, network, model, adam(config.sac, config.sac.updates_in(config.steps)))

@@ -95,6 +95,13 @@ def title_of(config: Config, continuous: bool = False) -> str:
     return title + ("" if memory == declaration.memories[0] else f" ({memory.upper()})")
 
 
+def pretrains(config: Config) -> bool:
+    """Whether Double DQN begins on the random episodes of stage 1."""
+    declaration = variant(config.agent)
+    remembers = declaration.uses_representation and not declaration.sees_state
+    return remembers and config.stage1.data == "random" and config.dqn.pretrain_updates > 0
+
+
 def stage1_of(config: Config) -> Stage1Config:
     """Stage 1 as the agent wants it: Believer has its KL penalty in the place of CLUB, DIM and shrinkage. What asks z_o
     for the simulator's variables it keeps: z_o alone is what agents see of a frame there (on the robots), and its own,

@@ -8,7 +8,8 @@ from mijax.types import Metrics
 
 
 def dim_jensen_shannon(
-    scores: jax.Array, identical: jax.Array | None = None, weight: jax.Array | None = None
+    scores: jax.Array, identical: jax.Array | None = None, weight: jax.Array | None = None,
+    different: jax.Array | None = None,
 ) -> tuple[jax.Array, Metrics]:
     """Minus the Jensen-Shannon bound of I(x; E(x)): E[sp(-score of x with E(x))] + E[sp(score of x' with E(x))].
 
@@ -20,10 +21,14 @@ def dim_jensen_shannon(
     over its own negatives, then the rows are averaged, so that every sample counts once however often its input
     occurs; a row without negatives contributes none. The loss falls to 0 when all different inputs are told apart.
 
+    With `different` as well, only those pairs are negatives. Where these are states that show the same observation o,
+    what has to be told apart is what o does not tell: a bound of I(x; E(x) | o).
+
     Args:
         scores: (B, B) the score of input x_j with feature E(x_i) at [i, j].
         identical: (B, B) bool, whether x_i and x_j are the same input, or None.
         weight: (B,) probabilities of the rows, summing to one, or None when all weigh 1 / B.
+        different: (B, B) bool, which pairs are negatives; None: all that are not `identical`.
 
     Returns:
         The loss, in nats, and metrics.
@@ -38,9 +43,10 @@ def dim_jensen_shannon(
         positive_rows = jax.nn.softplus(-jnp.diagonal(scores))
         negative_rows = jax.nn.softplus(scores) @ weight
     else:
-        chex.assert_shape(identical, (size, size))
+        different = ~identical if different is None else different
+        chex.assert_shape([identical, different], (size, size))
         positive_rows = _row_mean(jax.nn.softplus(-scores), jnp.where(identical, weight[None], 0.0))
-        negative_rows = _row_mean(jax.nn.softplus(scores), jnp.where(identical, 0.0, weight[None]))
+        negative_rows = _row_mean(jax.nn.softplus(scores), jnp.where(different, weight[None], 0.0))
     positive, negative = weight @ positive_rows, weight @ negative_rows
     return positive + negative, {"dim": -(positive + negative)}
 

@@ -32,6 +32,7 @@ class Transitions:
     ground_truth: jax.Array  # (N, V) float32  `Environment.variables` before the action
     reveals: jax.Array  # (N,) bool  whether `observation` shows what is otherwise hidden
     episode: jax.Array  # (N,) int32
+    key: jax.Array  # (2,) uint32  data of the key that the episodes follow from
     moments: EnvState | None = None  # leaves (S, ...)  what shows each state, to be augmented; None: not kept
 
     @property
@@ -47,13 +48,9 @@ class Episodes:
     Frames have T + 1 entries: the one that ends an episode is the last of its `length` + 1.
     """
 
-    state: jax.Array  # (E, T + 1, *state_shape)
-    observation: jax.Array  # (E, T + 1, *observation_shape)
-    action: jax.Array  # (E, T, ...)
-    reward: jax.Array  # (E, T) float32
-    terminated: jax.Array  # (E, T) bool, on arriving
-    ground_truth: jax.Array  # (E, T + 1, V) float32
-    reveals: jax.Array  # (E, T + 1) bool
+    env_state: EnvState  # leaves (E, T + 1, ...)
+    timestep: TimeStep  # leaves (E, T + 1, ...)
+    action: jax.Array  # (E, T, ...)  action t leads from frame t to frame t + 1
     length: jax.Array  # (E,) int32  steps of each episode
 
 
@@ -61,46 +58,42 @@ class Episodes:
 def random_episodes(env: Environment, key: jax.Array, num_episodes: int) -> Episodes:
     """`num_episodes` whole episodes of the uniform random policy, side by side."""
 
-    def frame(env_state, timestep):
-        return timestep.state, timestep.observation, env.ground_truth(env_state), env.reveals(env_state)
-
-    def rollout(episode_key):
+    def rollout(episode_key: jax.Array) -> Episodes:
         keys = jax.random.split(episode_key, env.horizon + 1)
-        first_state, first = env.reset(keys[0])
+        first = env.reset(keys[0])
 
-        def step(carry, step_key):
+        def step(carry: tuple, step_key: jax.Array) -> tuple:
             env_state, alive = carry
             action_key, env_key = jax.random.split(step_key)
             action = env.action_spec.sample(action_key)
             env_state, timestep = env.step(env_key, env_state, action)
-            arrived = (action, timestep.reward, timestep.terminated)
-            return (env_state, alive & ~timestep.done), (arrived, frame(env_state, timestep), alive)
+            return (env_state, alive & ~timestep.done), (action, (env_state, timestep), alive)
 
-        start = (first_state, jnp.ones((), bool))
-        _, ((action, reward, terminated), frames, alive) = jax.lax.scan(step, start, keys[1:])
-        whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), frame(first_state, first), frames)
-        return action, reward, terminated, whole, jnp.sum(alive, dtype=jnp.int32)
+        _, (action, frames, alive) = jax.lax.scan(step, (first[0], jnp.ones((), bool)), keys[1:])
+        env_state, timestep = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, frames)
+        return Episodes(env_state, timestep, action, jnp.sum(alive, dtype=jnp.int32))
 
-    action, reward, terminated, whole, length = jax.vmap(rollout)(jax.random.split(key, num_episodes))
-    state, observation, ground_truth, reveals = whole
-    return Episodes(state=state, observation=observation, action=action, reward=reward, terminated=terminated,
-                    ground_truth=ground_truth, reveals=reveals, length=length)
+    return jax.vmap(rollout)(jax.random.split(key, num_episodes))
 
 
-def flatten(episodes: Episodes) -> Transitions:
-    """Cut episodes into transitions and store each distinct frame once."""
-    e = jax.tree.map(np.asarray, episodes)
-    horizon = e.reward.shape[1]
-    row, step = np.nonzero(np.arange(horizon) < e.length[:, None])
-    seen = np.arange(horizon + 1) <= e.length[:, None]
-    states, state_index = _distinct(e.state, seen)
-    observations, observation_index = _distinct(e.observation, seen)
+def random_transitions(env: Environment, key: jax.Array, num_episodes: int) -> Transitions:
+    """The transitions of `random_episodes`, each distinct frame stored once."""
+    episodes = random_episodes(env, key, num_episodes)
+    truth, reveals = jax.jit(jax.vmap(jax.vmap(lambda moment: (env.ground_truth(moment), env.reveals(moment)))))(
+        episodes.env_state)
+    shown, action, length, truth, reveals = jax.device_get(
+        (episodes.timestep, episodes.action, episodes.length, truth, reveals))
+    row, step = np.nonzero(np.arange(env.horizon) < length[:, None])
+    seen = np.arange(env.horizon + 1) <= length[:, None]
+    states, state_index = _distinct(shown.state, seen)
+    observations, observation_index = _distinct(shown.observation, seen)
     columns: dict[str, np.ndarray] = {
         "states": states, "observations": observations,
         "state": state_index[row, step], "next_state": state_index[row, step + 1],
         "observation": observation_index[row, step], "next_observation": observation_index[row, step + 1],
-        "action": e.action[row, step], "reward": e.reward[row, step], "terminal": e.terminated[row, step],
-        "ground_truth": e.ground_truth[row, step], "reveals": e.reveals[row, step], "episode": row.astype(np.int32)}
+        "action": action[row, step], "reward": shown.reward[row, step + 1],
+        "terminal": shown.terminated[row, step + 1], "ground_truth": truth[row, step], "reveals": reveals[row, step],
+        "episode": row.astype(np.int32), "key": np.asarray(jax.random.key_data(key))}
     return Transitions(**{name: jnp.asarray(column) for name, column in columns.items()})
 
 
@@ -153,7 +146,7 @@ def collect(
     """
     if source == "demonstrations":
         return demonstrated(env, key, num_episodes, moved)
-    return flatten(random_episodes(env, key, num_episodes))
+    return random_transitions(env, key, num_episodes)
 
 
 def demonstrated(env: Environment, key: jax.Array, num_episodes: int, moved: bool = False) -> Transitions:
@@ -174,7 +167,7 @@ def demonstrated(env: Environment, key: jax.Array, num_episodes: int, moved: boo
         states=shown.state, observations=shown.observation, state=jnp.asarray(now), observation=jnp.asarray(now),
         action=jnp.asarray(actions[now]), reward=shown.reward[after], next_state=jnp.asarray(after),
         next_observation=jnp.asarray(after), terminal=shown.terminated[after], ground_truth=truth[now],
-        reveals=reveals[now], episode=jnp.asarray(row, jnp.int32), moments=moments)
+        reveals=reveals[now], episode=jnp.asarray(row, jnp.int32), key=jax.random.key_data(key), moments=moments)
 
 
 @functools.partial(jax.jit, static_argnums=0)

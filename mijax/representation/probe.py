@@ -18,7 +18,7 @@ from mijax.config import Stage1Config
 from mijax.losses.club import club_all_pairs
 from mijax.representation.dataset import Transitions, collect
 from mijax.representation.model import evaluate, networks_for
-from mijax.representation.train import History, encode_frames, standardize
+from mijax.representation.train import History, encode_frames, seen_by_estimator, standardize
 from mijax.types import Representation
 
 ROUND_OFF = 1e-5
@@ -290,7 +290,8 @@ def _errors(
     reward, guess_s, guess_o = evaluate(
         networks.dynamics, history.dynamics, z_s, z_o, networks.encode_action(data.action))
     weight = jnp.full(data.size, 1 / data.size, jnp.float32)
-    mean, log_variance = evaluate(networks.estimator, history.estimator, standardize(z_s, weight))
+    mean, log_variance = evaluate(
+        networks.estimator, history.estimator, seen_by_estimator(history.estimator_view, z_s, weight))
     goes_on = ~np.asarray(data.terminal)
 
     def error(guess: jax.Array, actual: jax.Array, rows: np.ndarray) -> float:

@@ -231,7 +231,8 @@ def _probe_all(
         representation, report = representation_of(problem, state), None
         if np.isfinite(metrics["loss"][member]):
             history = History(
-                metrics={}, dynamics=state.parameters["dynamics"], estimator=state.estimator.parameters, updates=0,
+                metrics={}, dynamics=state.parameters["dynamics"], estimator=state.estimator.parameters,
+                estimator_view=problem.config.estimator_view, updates=0,
                 compile_seconds=0.0, seconds=0.0)
             report = probe_on(heldout, representation, env, jax.random.key(0) if key is None else key, history,
                               networks=key is not None)

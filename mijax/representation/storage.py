@@ -16,7 +16,7 @@ from mijax.types import Representation
 
 PARAMETERS_FILE = "representation.msgpack"
 FACTS_FILE = "representation.json"
-FORMAT = 1
+FORMAT = 2
 """Raised whenever folders of an earlier version cannot be read any more."""
 
 
@@ -88,4 +88,5 @@ def _template(env: Environment, features: int) -> Representation:
     zeros = [np.zeros((1, *spec.shape), spec.dtype) for spec in (env.state_spec, env.observation_spec)]
     parameters = init_parameters(networks_for(env, features), jax.random.key(0), *map(jax.numpy.asarray, zeros))
     return Representation(phi=parameters["phi"], psi=parameters["psi"],
-                          z_s_mean=np.zeros(features, np.float32), z_s_variance=np.zeros((), np.float32))  # pyright: ignore[reportArgumentType]
+                          z_s_mean=np.zeros(features, np.float32), z_s_variance=np.zeros((), np.float32),  # pyright: ignore[reportArgumentType]
+                          data_key=np.zeros(2, np.uint32))  # pyright: ignore[reportArgumentType]

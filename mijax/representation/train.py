@@ -18,7 +18,7 @@ from flax import struct
 
 from envs_mjx.base import Environment
 from envs_mjx.errors import UserError
-from mijax.config import Stage1Config
+from mijax.config import EstimatorView, Stage1Config
 from mijax.frames import Frames, Patches, keep_present
 from mijax.losses.belief import kl_standard_normal
 from mijax.losses.club import club_all_pairs, gaussian_fit
@@ -32,6 +32,8 @@ from mijax.representation.problem import Batch, Problem
 from mijax.types import Metrics, Params, Representation
 
 ENCODER_NETWORKS = ("phi", "psi", "dynamics", "discriminator_s", "discriminator_o")
+DIRECTION_FLOOR = 1e-4
+"""Added to the variance of a principal direction before dividing by it, as a fraction of the variance of all."""
 STANDARDIZE_FLOOR = 1e-6
 """Added to the variance of a feature before dividing by it, as a fraction of the mean variance of all features."""
 FrameFunction = Callable[[Frames], jax.Array]
@@ -113,6 +115,8 @@ class History:
     """Parameters of the dynamics model, for the probe."""
     estimator: Params
     """Parameters of q(z_o | z_s), for the probe."""
+    estimator_view: EstimatorView
+    """How it sees z_s."""
     updates: int
     """Encoder updates made."""
     compile_seconds: float
@@ -200,6 +204,23 @@ def standardize(z: jax.Array, weight: jax.Array) -> jax.Array:
     return centered * jax.lax.rsqrt(variance + STANDARDIZE_FLOOR * jnp.mean(variance) + 1e-12)[None]
 
 
+def standardize_directions(z: jax.Array, weight: jax.Array) -> jax.Array:
+    """(B, F) features with mean 0 and, in each of their principal directions, variance 1, or less where it has next to
+    none of the variance of all. The map is symmetric, so that it changes little from batch to batch, and a constant:
+    gradients pass through it as through any linear map."""
+    centered = z - (weight @ z)[None]
+    covariance = jax.lax.stop_gradient((centered * weight[:, None]).T @ centered)
+    variance, directions = jnp.linalg.eigh(covariance)
+    variance = jnp.maximum(variance, 0.0)
+    scale = jax.lax.rsqrt(variance + DIRECTION_FLOOR * jnp.sum(variance) + 1e-12)
+    return centered @ (directions * scale[None]) @ directions.T
+
+
+def seen_by_estimator(view: EstimatorView, z_s: jax.Array, weight: jax.Array) -> jax.Array:
+    """(B, F) z_s as CLUB's q sees it, under (B,) probabilities; see `Stage1Config.estimator_view`."""
+    return (standardize_directions if view == "directions" else standardize)(z_s, weight)
+
+
 def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> Features:
     """z_s, z_o, their successors (constants), and what the discriminators say of the inputs: (B, F) each."""
     networks, config, rows, shown = problem.networks, problem.config, batch.rows, batch.shown
@@ -233,9 +254,14 @@ def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> F
     return Features(z_s=z_s, z_o=z_o, next_z_s=next_z_s, next_z_o=next_z_o, local_s=local_s, local_o=local_o)
 
 
-def dim_loss(z: jax.Array, local: jax.Array, index: jax.Array, weight: jax.Array) -> jax.Array:
-    """L_DIM (Eq. 8) of features and discriminator outputs (B, F) of the frames at (B,) `index`."""
-    return dim_jensen_shannon(z @ local.T, index[:, None] == index[None, :], weight)[0]
+def dim_loss(
+    z: jax.Array, local: jax.Array, index: jax.Array, weight: jax.Array, shown: jax.Array | None = None
+) -> jax.Array:
+    """L_DIM (Eq. 8) of features and discriminator outputs (B, F) of the frames at (B,) `index`; given the observations
+    that each shows, (B,) `shown`, only those that show the same one have to be told apart."""
+    same = index[:, None] == index[None, :]
+    different = None if shown is None else ~same & (shown[:, None] == shown[None, :])
+    return dim_jensen_shannon(z @ local.T, same, weight, different)[0]
 
 
 def encoder_loss(
@@ -255,7 +281,8 @@ def encoder_loss(
     fit = fit_estimator(fit, problem, batch, f.z_s, f.z_o, optimizer)
     reward, predicted_z_s, predicted_z_o = evaluate(
         networks.dynamics, parameters["dynamics"], f.z_s, f.z_o, networks.encode_action(rows.action))
-    mean, log_variance = evaluate(networks.estimator, fit.parameters, standardize(f.z_s, weight))
+    mean, log_variance = evaluate(
+        networks.estimator, fit.parameters, seen_by_estimator(problem.config.estimator_view, f.z_s, weight))
     terms = {
         "reward_loss": (weights.lambda_r, reward_loss(reward, rows.reward, batch.reward_weight)[0]),
         "z_s_loss": (weights.lambda_s, next_feature_loss(predicted_z_s, f.next_z_s, rows.terminal, weight)[0]),
@@ -268,7 +295,8 @@ def encoder_loss(
     each = jnp.arange(rows.size, dtype=jnp.int32)
     s, o = (rows.state, rows.observation) if batch.shown is None else (each, each)
     if f.local_s is not None:
-        terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, s, weight)
+        alike = o if problem.config.state_bound == "conditional" else None
+        terms["dim_s_loss"] = weights.lambda_dim_s, dim_loss(f.z_s, f.local_s, s, weight, alike)
     if f.local_o is not None:
         terms["dim_o_loss"] = weights.lambda_dim_o, dim_loss(f.z_o, f.local_o, o, weight)
     if problem.config.lower_bound == "variables" and problem.config.lambda_dim_o > 0:
@@ -285,7 +313,8 @@ def fit_estimator(
     optimizer: optax.GradientTransformation
 ) -> EstimatorState:
     """Move q(z_o | z_s) towards the current features, which stay constant, `estimator_updates` times on this batch."""
-    z_s, z_o = (jax.lax.stop_gradient(standardize(z, batch.weight)) for z in (z_s, z_o))
+    z_s = jax.lax.stop_gradient(seen_by_estimator(problem.config.estimator_view, z_s, batch.weight))
+    z_o = jax.lax.stop_gradient(standardize(z_o, batch.weight))
 
     def loss(parameters: Params) -> jax.Array:
         mean, log_variance = evaluate(problem.networks.estimator, parameters, z_s)
@@ -383,6 +412,7 @@ def train_on(
     history = History(
         metrics={name: np.array([m[name] for m in seen]) for name in seen[-1]},
         dynamics=state.parameters["dynamics"], estimator=state.estimator.parameters,
+        estimator_view=config.estimator_view,
         updates=config.epochs * problem.updates_per_epoch,
         compile_seconds=compiled - started, seconds=time.perf_counter() - compiled)
     representation = representation_of(problem, state)
@@ -408,7 +438,7 @@ def representation_of(problem: Problem, state: TrainState) -> Representation:
     mean = weight @ z
     return Representation(
         phi=phi, psi=state.parameters["psi"], z_s_mean=mean,
-        z_s_variance=jnp.sum(weight @ jnp.square(z - mean[None])))
+        z_s_variance=jnp.sum(weight @ jnp.square(z - mean[None])), data_key=data.key)
 
 
 @functools.partial(jax.jit, static_argnums=0)

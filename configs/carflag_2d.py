@@ -6,10 +6,10 @@
 carflag_2d_mi_seed_2). Twenty-five minutes a seed on one core, of them six to seven for stage 1.
 
 Stage 1 departs from Table 3, with which z_s never learnt the goal here: the random policy meets the reward once in 250
-steps, which is too rare to tell phi where the goal is. So states that show the same observation have to be told apart,
-CLUB's q sees every direction of z_s, and rewarded transitions join every batch. With the other grid worlds' step size
-and target rate the values of one seed in three ran away, to 3.3 where an episode earns 1 at most: hence half of both,
-and values bounded by 1 (results/what_matters.md).
+steps, too rarely to tell phi where the goal is from so few episodes. So states that show the same observation have to
+be told apart, CLUB's q sees every direction of z_s, and rewarded transitions join every batch. With the other grid
+worlds' step size and target rate the values of one seed in three ran away, to 3.3 where an episode earns 1 at most:
+hence half of both, and values bounded by 1 (results/what_matters.md).
 """
 
 from mijax.config import Config, DQNConfig, InformationConfig, NetworkConfig, Stage1Config

@@ -115,6 +115,8 @@ class Stage1Config:
                           "lambda_dim_o", "lambda_kl", "rewarded", "phi_shrinkage", "copies")
         require(self.copies == 0 or self.data == "demonstrations", "stage1.copies", self.copies,
                 "0, unless --stage1.data is demonstrations")
+        require(self.state_bound == "jensen_shannon" or self.data == "random", "stage1.state-bound", self.state_bound,
+                "jensen_shannon, unless --stage1.data is random: moments of demonstrations hardly look alike")
         require(self.heldout_episodes >= 2, "stage1.heldout-episodes", self.heldout_episodes,
                 "at least 2: probes are fitted on one half and scored on the other")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")

@@ -22,7 +22,7 @@ from envs_mjx.contract import check_contract
 from envs_mjx.errors import UserError
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
-from mijax.agents.variants import memory_of, needs_representation, pretrains, stage1_of, title_of, unread_groups
+from mijax.agents.variants import memory_of, needs_representation, pretrain_updates, stage1_of, title_of, unread_groups
 from mijax.config import Config, Stage1Config, config_from_dict, options_of, parse_seeds, require
 from mijax.hosts import Host, check, meet
 from mijax.learner import Learner, make_learner
@@ -206,7 +206,7 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
         require(needs_representation(config), "representation", options.representation,
                 f"none: --agent {config.agent} looks through no features here")
         source = RunFolder.open(options.representation)
-        _require_kind(source, stage1_of(config), pretrains(config))
+        _require_kind(source, stage1_of(config), pretrain_updates(config) > 0)
         fill = stage1.reuse(source, env, config.stage1.features, every_seed)
     unread = unread_options(config, env)
     if unread:

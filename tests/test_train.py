@@ -235,6 +235,7 @@ def test_a_stored_configuration_comes_back() -> None:
     (["--steps", "2000"], "more than the 2000 of the warm-up"),
     (["--stage1.heldout-episodes", "1"], "--stage1.heldout-episodes"),
     (["--stage1.data", "demonstrations"], "--stage1.data"),
+    (["--stage1.data", "demonstrations", "--stage1.state-bound", "conditional"], "--stage1.state-bound"),
     (["--sac.trunk", "psi"], "--sac.trunk"),
     (["--network.dropout", "0.99"], "--network.dropout"),
     (["--network.critic-hidden", "0"], "--network.critic-hidden"),

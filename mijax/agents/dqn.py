@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from envs_mjx.base import DiscreteActions, Environment
 from mijax.agents.core import Agent, AgentState, Heads, adam, episode_mean, may_follow, transitions
-from mijax.agents.variants import Variant, memory_of, pretrains, variant
+from mijax.agents.variants import Variant, memory_of, pretrain_updates, variant
 from mijax.config import Config, ConfigError, DQNConfig
 from mijax.losses import td
 from mijax.losses.returns import traced_returns
@@ -45,7 +45,7 @@ class DQN(Agent):
     @property
     def pretrain_updates(self) -> int:
         """On the random episodes of stage 1, where the agent has any."""
-        return self.options.pretrain_updates if pretrains(self.config) else 0
+        return pretrain_updates(self.config)
 
     def init_network(self, key: jax.Array) -> Params:
         """Fresh parameters of the network."""
@@ -185,7 +185,7 @@ def make_dqn(env: Environment, config: Config) -> DQN:
         raise ConfigError(f"--domain: {env.name} has continuous actions, accepted by this agent: discrete actions")
     declaration = variant(config.agent)
     network = _network(env, config, declaration)
-    updates = config.dqn.updates_in(config.steps) + (config.dqn.pretrain_updates if pretrains(config) else 0)
+    updates = pretrain_updates(config) + config.dqn.updates_in(config.steps)
     information_model = None
     if declaration.informed and config.information.intrinsic_weight > 0:
         information_model = InformationModel(cast(TwoBranchQ, network).top.clone(), config.stage1.features)

@@ -95,11 +95,11 @@ def title_of(config: Config, continuous: bool = False) -> str:
     return title + ("" if memory == declaration.memories[0] else f" ({memory.upper()})")
 
 
-def pretrains(config: Config) -> bool:
-    """Whether Double DQN begins on the random episodes of stage 1."""
+def pretrain_updates(config: Config) -> int:
+    """Updates with which Double DQN begins on the random episodes of stage 1; 0 for an agent that has none."""
     declaration = variant(config.agent)
-    remembers = declaration.uses_representation and not declaration.sees_state
-    return remembers and config.stage1.data == "random" and config.dqn.pretrain_updates > 0
+    has_episodes = declaration.uses_representation and not declaration.sees_state and config.stage1.data == "random"
+    return config.dqn.pretrain_updates if has_episodes else 0
 
 
 def stage1_of(config: Config) -> Stage1Config:

@@ -6,11 +6,12 @@ Solved in 5 seeds of 5, first after 11 000 to 21 000 steps, optimal at the end (
 on two shared cores with `make train`, installation included.
 """
 
-from mijax.config import Config, Stage1Config
+from mijax.config import Config, DQNConfig, Stage1Config
 
 CONFIG = Config(
     domain="heaven_hell",
     steps=100_000,
     stage1=Stage1Config(episodes=500, epochs=150, learning_rate=3e-3, lambda_r=10.0, lambda_s=1.0,
                         lambda_o=0.5, lambda_club=1.0, lambda_dim_s=0.0, lambda_dim_o=1.0),
+    dqn=DQNConfig(pretrain_updates=2000),
 )

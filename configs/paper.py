@@ -35,8 +35,8 @@ def paper(config: Config, vector_observation: bool) -> Config:
         observation_embedding=64 if vector_observation or domain in ROBOTS else 100)
     dqn = dataclasses.replace(
         config.dqn, learning_rate=CRITIC_LEARNING_RATE.get(domain, 3e-4), final_learning_rate=1.0, discount=0.99,
-        trace_decay=0.0, target_rate=0.005, batch_episodes=64, updates_per_step=0.25, warmup_episodes=10,
-        epsilon_steps=steps // 10, value_bound=0.0, pretrain_updates=0)
+        trace_decay=0.0, trace_tolerance=0.0, target_rate=0.005, batch_episodes=64, updates_per_step=0.25,
+        warmup_episodes=10, epsilon_steps=steps // 10, value_bound=0.0, pretrain_updates=0)
     sac = dataclasses.replace(
         config.sac, learning_rate=3e-4, final_learning_rate=1.0, discount=0.99, trace_decay=0.0, target_rate=0.005,
         batch_episodes=64, updates_per_step=1.0, trunk="own", critic_norm=False, demonstration_share=0.0,

@@ -180,7 +180,11 @@ class DQNConfig:
     discount: float = 0.97
     """gamma of the learner (paper: 0.99). In the three grid worlds the belief-optimal policy is the same for both."""
     trace_decay: float = 0.9
-    """lambda of the Watkins Q(lambda) returns; 0 gives the one-step target (paper: 0)."""
+    """lambda of the returns: of Watkins' Q(lambda), but for `trace_tolerance`; 0 gives the one-step target (paper)."""
+    trace_tolerance: float = 0.1
+    """A return goes on through an action whose value is within this of the best, in units of reward. With 0 only
+    through the best one (Watkins): where several are as good, as while an agent wanders, nearly every return is then
+    cut, the best of several noisy values is believed at every step, and wandering pays."""
     target_rate: float = 0.01
     """tau: how far the target network moves towards the online network after every update (paper: 0.005)."""
     batch_episodes: int = 32
@@ -209,7 +213,7 @@ class DQNConfig:
 
     def __post_init__(self) -> None:
         _require_at_least("dqn.", self, 1, "batch_episodes", "replay_steps", "warmup_episodes", "epsilon_steps")
-        _require_at_least("dqn.", self, 0, "value_bound", "pretrain_updates")
+        _require_at_least("dqn.", self, 0, "value_bound", "trace_tolerance", "pretrain_updates")
         require(self.learning_rate > 0, "dqn.learning-rate", self.learning_rate, "a number > 0")
         require(self.updates_per_step > 0, "dqn.updates-per-step", self.updates_per_step, "a number > 0")
         require(self.batch_episodes % 2 == 0, "dqn.batch-episodes", self.batch_episodes, "an even number")

@@ -45,7 +45,8 @@ def loss_by_loops(q: Any, q_target: Any, bonus: np.ndarray, dqn: DQNConfig) -> t
             if dqn.value_bound:
                 value = min(max(value, -dqn.value_bound), dqn.value_bound)
             ended = tokens.terminated[row, t] or (tokens.truncated[row, t] and not dqn.bootstrap_at_time_limit)
-            greedy_next = t + 1 < end and tokens.previous_action[row, t + 1] == np.argmax(q[row, t])
+            taken = q[row, t, tokens.previous_action[row, t + 1]] if t + 1 < end else -np.inf
+            greedy_next = taken >= np.max(q[row, t]) - dqn.trace_tolerance
             cut += t + 1 < end and not greedy_next
             trace = dqn.trace_decay if greedy_next else 0.0
             future = 0.0 if ended else dqn.discount * ((1 - trace) * value + trace * later)
@@ -55,9 +56,13 @@ def loss_by_loops(q: Any, q_target: Any, bonus: np.ndarray, dqn: DQNConfig) -> t
 
 
 @pytest.mark.parametrize(
-    ("bootstrap", "trace_decay", "bound"), [(False, 0.0, 0.0), (True, 0.7, 0.0), (True, 0.7, 0.1)])
-def test_td_loss_by_hand(states: dict[str, AgentState], bootstrap: bool, trace_decay: float, bound: float):
-    config = changed(BASE, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay, value_bound=bound)
+    ("bootstrap", "trace_decay", "tolerance", "bound"),
+    [(False, 0.0, 0.0, 0.0), (True, 0.7, 0.0, 0.0), (True, 0.7, 0.1, 0.0), (True, 0.7, 0.0, 0.1)])
+def test_td_loss_by_hand(
+    states: dict[str, AgentState], bootstrap: bool, trace_decay: float, tolerance: float, bound: float
+):
+    config = changed(BASE, bootstrap_at_time_limit=bootstrap, trace_decay=trace_decay, trace_tolerance=tolerance,
+                     value_bound=bound)
     agent, state, tokens = agent_of(config), states["base"], episodes(DISCRETE)
     network: Any = jax.jit(agent.network.apply)
     q, q_target = (network({"params": p}, tokens).q for p in (state.params["agent"], state.target))
@@ -124,7 +129,7 @@ def test_f_learns_from_its_own_loss_only(states: dict[str, AgentState]):
 
 @pytest.mark.lenient
 def test_updates_move_the_target_a_little_and_learn_a_batch_by_heart(states: dict[str, AgentState]):
-    config = changed(CONFIG, learning_rate=1e-2)
+    config = changed(CONFIG, learning_rate=1e-2, trace_tolerance=0.0)
     config = dataclasses.replace(config, information=dataclasses.replace(config.information, intrinsic_weight=0.01))
     agent, state, tokens, rep = agent_of(config), states["mi"], episodes(DISCRETE), representation(SHAPES)
     update = jax.jit(agent.update)

@@ -41,6 +41,13 @@ def test_double_q_value_takes_the_target_of_the_online_choice():
     assert td.double_q_value(online, target).tolist() == [20.0, 7.0]
 
 
+def test_what_is_greedy_within_a_tolerance():
+    q, action = jnp.array([[1.0, 3.0, 2.75], [5.0, 0.0, 5.0]]), jnp.array([2, 2])
+    assert td.is_greedy(q, action).tolist() == [False, True]  # equals are as good
+    assert td.is_greedy(q, action, 0.25).tolist() == [True, True]
+    assert td.is_greedy(q, jnp.array([0, 1]), 1.5).tolist() == [False, False]
+
+
 @pytest.mark.parametrize("shape", [(1,), (5, 13), (2, 3, 6)])
 def test_returns_equal_a_backward_loop(shape: tuple[int, ...]):
     inputs = random_transitions(np.random.default_rng(0), shape)

@@ -146,7 +146,7 @@ class DQN(Agent):
         """
         dqn = self.config.dqn
         valid, action = transitions(tokens), tokens.previous_action[:, 1:]
-        greedy = jnp.argmax(q_select, axis=-1)[:, :-1] == action
+        greedy = td.is_greedy(q_select[:, :-1], action, dqn.trace_tolerance)
         q_target = averaged.q if averaged.critic is None else averaged.critic
         if dqn.value_bound > 0:
             q_target = jnp.clip(q_target, -dqn.value_bound, dqn.value_bound)

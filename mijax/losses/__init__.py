@@ -21,7 +21,7 @@ from mijax.losses.sac import (
     scale_loss,
     temperature_loss,
 )
-from mijax.losses.td import double_q_value, td_loss
+from mijax.losses.td import double_q_value, is_greedy, td_loss
 from mijax.losses.variables import variables_loss
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "gaussian_fit",
     "gaussian_log_density",
     "imitation_loss",
+    "is_greedy",
     "kl_standard_normal",
     "masked_mean",
     "negative_elbo",

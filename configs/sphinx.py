@@ -9,10 +9,10 @@ from mijax.config import Config, DQNConfig, InformationConfig, NetworkConfig, St
 
 CONFIG = Config(
     domain="sphinx",
-    steps=150_000,
+    steps=100_000,
     stage1=Stage1Config(episodes=500, epochs=300, learning_rate=3e-3, lambda_r=10.0, lambda_s=0.5, lambda_o=0.03,
                         lambda_club=0.3, lambda_dim_s=0.0, lambda_dim_o=0.5),
     network=NetworkConfig(action_embedding=16, observation_embedding=48),
-    dqn=DQNConfig(warmup_episodes=300, epsilon_steps=100_000),
+    dqn=DQNConfig(warmup_episodes=300, pretrain_updates=500, pretrained_epsilon=0.7, epsilon_steps=60_000),
     information=InformationConfig(intrinsic_weight=1.0),
 )

@@ -8,7 +8,7 @@ OPTIONS = {
     "network.action-embedding": 4, "network.observation-embedding": 4, "network.critic-hidden": 8,
     "network.auxiliary-hidden": 8, "stage1.episodes": 12, "stage1.heldout-episodes": 8, "stage1.epochs": 2,
     "stage1.batch-size": 100, "dqn.batch-episodes": 4, "dqn.replay-steps": 2000, "dqn.warmup-episodes": 4,
-    "evaluation.every": 200, "evaluation.episodes": 4, "checkpoint.every": 1,
+    "dqn.pretrain-updates": 0, "evaluation.every": 200, "evaluation.episodes": 4, "checkpoint.every": 1,
 }
 TINY = [word for name, value in OPTIONS.items() for word in (f"--{name}", str(value))]
 """As arguments of `mijax.train`."""

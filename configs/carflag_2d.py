@@ -21,7 +21,7 @@ CONFIG = Config(
                         phi_shrinkage=0.03, lambda_r=100.0, lambda_s=1.0, lambda_o=1.0, lambda_club=0.1,
                         lambda_dim_s=1.0, lambda_dim_o=1.0, state_bound="conditional", estimator_view="directions"),
     network=NetworkConfig(action_embedding=16, observation_embedding=48),
-    dqn=DQNConfig(learning_rate=5e-4, target_rate=0.005, value_bound=1.0, warmup_episodes=300,
+    dqn=DQNConfig(learning_rate=5e-4, trace_tolerance=0.0, target_rate=0.005, value_bound=1.0, warmup_episodes=300,
                   pretrain_updates=4000, epsilon_steps=100_000),
     information=InformationConfig(intrinsic_weight=0.0),
 )

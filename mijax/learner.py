@@ -1,6 +1,6 @@
 """The jitted loop: environment steps and gradient updates in a static schedule.
 
-`init(key)` makes the whole state of one seed and `go_on(state, ...)` advances it by a number of iterations. One
+`init(key)` makes the whole state of one seed and `run_chunk(state)` advances it by a fixed number of iterations. One
 iteration is always the same work: K steps in each of E environments, then updates_per_step * E * K updates. Seeds,
 devices, checkpoints and logging are wrapped around these two functions.
 """
@@ -55,21 +55,6 @@ class LearnerState:
     replay: Replay
     key: jax.Array  # typed PRNG key; every iteration folds its number into it
     iteration: jax.Array  # () int32, the next one; below 0 before the end of pre-training
-
-
-@struct.dataclass
-class ChunkSums:
-    """What the iterations of a chunk add up."""
-
-    iterations: jax.Array  # () int32
-    losses: Metrics
-    episodes: EpisodeTotals
-    epsilon: jax.Array  # () exploration after the last of them
-
-    def metrics(self) -> Metrics:
-        """Means over the iterations, and over the episodes that finished in them."""
-        losses = jax.tree.map(lambda x: x / self.iterations, self.losses)
-        return losses | self.episodes.metrics() | {"train/epsilon": self.epsilon}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,30 +210,18 @@ class Learner:
         """() exploration after so many steps."""
         return self.agent.epsilon(environment_steps)
 
-    def run_chunk(self, state: LearnerState) -> tuple[LearnerState, Metrics]:
-        """Advance to the next evaluation; metrics are means over the iterations of that chunk."""
-        state, sums = self.go_on(state, self.no_sums(state), self.iterations_per_chunk)
-        return state, sums.metrics()
-
-    def no_sums(self, state: LearnerState) -> ChunkSums:
-        """Those of a chunk that has not begun."""
-        losses = jax.eval_shape(self._learn, state, state.key)[1]
-        return ChunkSums(
-            iterations=jnp.zeros((), jnp.int32), losses=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), losses),
-            episodes=EpisodeTotals.zero(), epsilon=jnp.zeros(()))
-
-    def go_on(
-        self, state: LearnerState, sums: ChunkSums, iterations: jax.Array | int, acts: jax.Array | bool = True
-    ) -> tuple[LearnerState, ChunkSums]:
-        """Advance by `iterations`, in however many parts a chunk is run: the sums are the same bit for bit.
+    def run_chunk(
+        self, state: LearnerState, iterations: jax.Array | int | None = None, acts: jax.Array | bool = True
+    ) -> tuple[LearnerState, Metrics]:
+        """Advance by `iterations`; metrics are means over them.
 
         Args:
             state: of one seed.
-            sums: of the chunk so far.
-            iterations: () int32.
+            iterations: () int32, at least 1; default: up to the next evaluation.
             acts: () bool, whether the environments are stepped: not in pre-training. Both may be traced, so that one
                 compiled program serves all; under `vmap` they are not to be mapped, as every branch would then run.
         """
+        iterations = self.iterations_per_chunk if iterations is None else iterations
         steps = jnp.where(acts, self.config.steps_per_iteration, 0)
 
         def iterate(_: jax.Array, carry: tuple) -> tuple[LearnerState, EpisodeTotals, Metrics]:
@@ -261,9 +234,11 @@ class Learner:
             state = dataclasses.replace(state, iteration=state.iteration + 1)
             return state, *jax.tree.map(jnp.add, (totals, losses), (added, metrics))
 
-        state, totals, losses = jax.lax.fori_loop(0, iterations, iterate, (state, sums.episodes, sums.losses))
-        sums = ChunkSums(sums.iterations + iterations, losses, totals, self.epsilon(self.environment_steps(state)))
-        return state, sums
+        losses = jax.tree.map(
+            lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(self._learn, state, state.key)[1])
+        state, totals, losses = jax.lax.fori_loop(0, iterations, iterate, (state, EpisodeTotals.zero(), losses))
+        metrics = jax.tree.map(lambda x: x / iterations, losses) | totals.metrics()
+        return state, metrics | {"train/epsilon": self.epsilon(self.environment_steps(state))}
 
     def collect_chunk(self, state: LearnerState) -> tuple[EpisodeTotals, Replay]:
         """The environment steps of one chunk without its updates: what acting, stepping and storing cost."""

@@ -1,20 +1,19 @@
 """Many seeds at once. A seed follows the same random numbers alone and beside others, bit for bit but under `vmap`.
 
-Every strategy runs the same two functions, `Learner.init` and `Learner.go_on`:
+Every strategy runs the same two functions, `Learner.init` and `Learner.run_chunk`:
 
 * `map`: one compiled program, one seed after the other.
-* `shard`: the same, with the seeds dealt out to the devices, which work side by side. The cores of a CPU share every
-  chunk out evenly, whatever the number of seeds: a seed may run a part of it on one and the rest on another.
+* `shard`: the same, with the seeds dealt out to the devices, which work side by side.
 * `vmap`: the seeds of a device in one batched program, all devices side by side; packing is off, since a batched branch
   would run every branch. Dropout and the noise of actions, which are drawn in the shape of the rows, are others then.
   Two branches stay and both run: a robot's episodes are begun at every step, and CarFlag-2D's few frames are encoded
   beside all of them.
 """
 
-import math
+import collections
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -22,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mijax.config import SeedStrategy
-from mijax.learner import ChunkSums, Learner, LearnerState
+from mijax.learner import Learner, LearnerState
 from mijax.types import Metrics, Representation
 
 
@@ -45,30 +44,6 @@ def evaluation_key(seed: int, step: int) -> jax.Array:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 3), step)
 
 
-def share_out(jobs: Sequence[int], length: int, machines: int) -> list[list[tuple[int, int]]]:
-    """Jobs of equal length in queues that end together: McNaughton's wrap-around rule.
-
-    The jobs follow each other on a tape that is cut into one piece per machine. A job that a cut goes through is begun
-    by the later machine, as the first in its queue, and ended by the earlier one, as the last in its own.
-
-    Returns:
-        For each machine (job, how much of it) in order of time; at most `machines` queues, none of them empty.
-    """
-    limit = -(-len(jobs) * length // machines)
-    queues: list[list[tuple[int, int]]] = []
-    room = 0
-    for job in jobs:
-        left = length
-        while left:
-            if not room:
-                queues.append([])
-                room = limit
-            part = min(left, room)
-            queues[-1].append((job, part))
-            left, room = left - part, room - part
-    return queues
-
-
 class SeedRunner:
     """Advances the learners of several seeds in lockstep."""
 
@@ -86,18 +61,14 @@ class SeedRunner:
         groups = [self.seeds[i :: len(devices)] for i in range(len(devices))] if self._batched else [
             (seed,) for seed in self.seeds]
         self._groups = {group[0]: group for group in groups}  # seeds that are run as one, named by the first of them
-        self._devices = devices
-        self._device = {first: devices[i * len(devices) // len(self._groups)] for i, first in enumerate(self._groups)}
-        self._divides = devices[0].platform == "cpu"  # another device would have to copy a replay over
+        self._device = {first: devices[i % len(devices)] for i, first in enumerate(self._groups)}
         self._pool = ThreadPoolExecutor(len(devices))
         mapped = jax.vmap if self._batched else lambda f: f
         self._mapped = mapped
         self._evaluations: dict[int, Callable] = {}  # by number of episodes
         self._init = jax.jit(mapped(self.learner.init))
-        go_on = self.learner.go_on
-        self._chunk = jax.jit(jax.vmap(go_on, (0, 0, None, None)) if self._batched else go_on, donate_argnums=(0, 1))
-        self._no_sums = jax.jit(mapped(self.learner.no_sums))
-        self._metrics = jax.jit(mapped(ChunkSums.metrics))
+        chunk = self.learner.run_chunk
+        self._chunk = jax.jit(jax.vmap(chunk, (0, None, None)) if self._batched else chunk, donate_argnums=0)
         self._states: dict[int, LearnerState] = {}  # by group
 
     def compile(self, template: LearnerState) -> list[jax.stages.Compiled]:
@@ -113,11 +84,9 @@ class SeedRunner:
         def work(first: int) -> jax.stages.Compiled:
             several = (len(self._groups[first]),) if self._batched else ()
             sharding = jax.sharding.SingleDeviceSharding(self._device[first])
-            state, sums = jax.tree.map(
-                lambda x: x.update(shape=several + x.shape, sharding=sharding),
-                (template, jax.eval_shape(self.learner.no_sums, template)))
+            state = jax.tree.map(lambda x: x.update(shape=several + x.shape, sharding=sharding), template)
             with jax.default_device(self._device[first]):
-                return self._chunk.lower(state, sums, jnp.int32(1), jnp.bool_(True)).compile()
+                return self._chunk.lower(state, jnp.int32(1), jnp.bool_(True)).compile()
 
         one_of_each = {device: first for first, device in reversed(self._device.items())}
         return list(self._pool.map(work, sorted(one_of_each.values(), key=self.seeds.index)))
@@ -165,31 +134,9 @@ class SeedRunner:
         return self._as_numbers(self._run(self.learner.iterations_per_chunk, acts=True))
 
     def _run(self, iterations: int, acts: bool) -> dict[int, Metrics]:
-        """So many iterations of every group; metrics by group."""
-        names = list(self._groups)
-        queues = share_out(names, iterations, len(self._devices)) if self._divides else [
-            [(first, iterations) for first in names if self._device[first] == device] for device in self._devices]
-
-        def run(device: Any, first: int, part: int, begun: Future | None = None) -> tuple[LearnerState, ChunkSums]:
-            with jax.default_device(device):
-                before = begun.result() if begun else (self._states[first], self._no_sums(self._states[first]))
-                arguments = jax.device_put(before, device)
-                return jax.block_until_ready(self._chunk(*arguments, jnp.int32(part), jnp.bool_(acts)))
-
-        placed = list(zip(self._devices, queues, strict=False))  # few iterations may leave devices without any
-        begun = {queue[0][0]: self._pool.submit(run, device, *queue[0])
-                 for device, queue in placed if queue[0][1] < iterations}
-
-        def work(device: Any, queue: list[tuple[int, int]]) -> dict[int, tuple[LearnerState, ChunkSums]]:
-            if queue[0][0] in begun:
-                begun[queue[0][0]].result()
-                queue = queue[1:]
-            return {first: run(device, first, part, begun.get(first)) for first, part in queue}
-
-        done = self._pool.map(lambda pair: work(*pair), placed)
-        results = {first: result for part in done for first, result in part.items()}
-        self._states = {first: results[first][0] for first in names}
-        return {first: self._metrics(results[first][1]) for first in names}
+        results = self._each(lambda state: self._chunk(state, jnp.int32(iterations), jnp.bool_(acts)), self._states)
+        self._states = {first: state for first, (state, _) in results.items()}
+        return {first: metrics for first, (_, metrics) in results.items()}
 
     def evaluate(self, num_episodes: int) -> dict[int, dict[str, float]]:
         """Greedy evaluation of every seed: means over the episodes."""
@@ -203,7 +150,7 @@ class SeedRunner:
 
     def environment_seconds(self) -> float:
         """Seconds in which the whole run, all seeds, acted, stepped and stored: timed on one chunk of the first,
-        for as many of its kind as a device runs one after the other."""
+        for as many of its kind as the busiest device runs one after the other."""
         def stored(state: LearnerState) -> Any:
             # All of the replay is looked at, or XLA would leave its writing out.
             return jax.tree.map(total, self.learner.collect_chunk(state))
@@ -219,8 +166,7 @@ class SeedRunner:
             jax.block_until_ready(program(self._states[seed]))
             seconds.append(time.perf_counter() - started)
         chunks = self.step / self.learner.config.evaluation.every
-        each = len(self._groups) / len(self._devices)
-        return seconds[-1] * chunks * (each if self._divides else math.ceil(each))
+        return seconds[-1] * chunks * max(collections.Counter(self._device.values()).values())
 
     def _by_group(self, by_seed: dict[int, Any]) -> dict[int, Any]:
         """Of each seed, or of each group of batched seeds with a leading axis for them."""

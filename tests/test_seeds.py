@@ -14,7 +14,7 @@ from envs_mjx import registry
 from launch.scale import gflop, traffic
 from mijax.config import Config, DQNConfig, EvaluationConfig, SeedStrategy, Stage1Config
 from mijax.learner import LearnerState, make_learner
-from mijax.seeds import SeedRunner, resolve, share_out, training_key
+from mijax.seeds import SeedRunner, resolve, training_key
 
 pytestmark = pytest.mark.lenient
 
@@ -176,32 +176,9 @@ def test_learning_is_compiled_once_before_there_is_a_state(
     follow: Callable[[SeedStrategy], Followed], strategy: SeedStrategy,
 ) -> None:
     followed = follow(strategy)
-    learning = [name for name in followed.compiled if "go_on" in name]
+    learning = [name for name in followed.compiled if "chunk" in name]
     assert learning
-    assert [name for name in followed.compiled_at_first if "go_on" in name] == learning
-
-
-@pytest.mark.parametrize("machines", [1, 2, 3, 4])
-@pytest.mark.parametrize("jobs", [4, 5, 7])
-@pytest.mark.parametrize("length", [1, 10, 50])
-def test_jobs_are_shared_out_evenly(jobs: int, machines: int, length: int) -> None:
-    """All of every job is done, its parts one after the other, and no machine works longer than it must."""
-    queues = share_out(range(jobs), length, machines)
-    assert len(queues) <= machines
-    limit = -(-jobs * length // machines)
-    assert max(sum(part for _, part in queue) for queue in queues) == limit
-    spans: dict[int, list[tuple[int, int]]] = {}
-    for queue in queues:
-        now = 0
-        for job, part in queue:
-            spans.setdefault(job, []).append((now, now + part))
-            now += part
-    assert sorted(spans) == list(range(jobs))
-    for job, parts in spans.items():
-        assert sum(end - start for start, end in parts) == length
-        if len(parts) > 1:
-            (rest, _), (start, end) = parts  # the earlier machine's is done last
-            assert (start, rest >= end) == (0, True), job
+    assert [name for name in followed.compiled_at_first if "chunk" in name] == learning
 
 
 def test_auto() -> None:

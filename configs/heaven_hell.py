@@ -11,7 +11,7 @@ from mijax.config import Config, DQNConfig, Stage1Config
 CONFIG = Config(
     domain="heaven_hell",
     steps=100_000,
-    stage1=Stage1Config(episodes=300, epochs=250, learning_rate=3e-3, lambda_r=10.0, lambda_s=1.0,
+    stage1=Stage1Config(episodes=150, epochs=500, learning_rate=3e-3, lambda_r=10.0, lambda_s=1.0,
                         lambda_o=0.5, lambda_club=1.0, lambda_dim_s=0.0, lambda_dim_o=1.0),
-    dqn=DQNConfig(pretrain_updates=2000),
+    dqn=DQNConfig(pretrain_updates=800),
 )

@@ -121,12 +121,12 @@ def _require_kind(source: RunFolder, wanted: Stage1Config, pretrains: bool) -> N
     stored = source.config()
     read = config_from_dict({name: stored[name] for name in ("agent", "stage1") if name in stored})
     other = stage1_of(read) if "agent" in stored else read.stage1
-    require(not pretrains or (other.data, other.episodes) == (wanted.data, wanted.episodes), "stage1.episodes",
-            f"{wanted.episodes} ({wanted.data})",
-            f"{other.episodes} ({other.data}), as {source.path} has, whose episodes the replay starts with")
     kinds = {True: "Believer's (a KL penalty)", False: "ours (CLUB)"}
     require((other.lambda_kl > 0) == (wanted.lambda_kl > 0), "representation", str(source.path),
             f"a run with features of the other kind: {kinds[wanted.lambda_kl > 0]}")
+    require(not pretrains or (other.data, other.episodes) == (wanted.data, wanted.episodes), "stage1.episodes",
+            f"{wanted.episodes} ({wanted.data})",
+            f"{other.episodes} ({other.data}), as {source.path} has, whose episodes the replay starts with")
 
 
 def folder_of(options: TrainOptions) -> pathlib.Path:
@@ -206,8 +206,8 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
         require(needs_representation(config), "representation", options.representation,
                 f"none: --agent {config.agent} looks through no features here")
         source = RunFolder.open(options.representation)
-        _require_kind(source, stage1_of(config), pretrain_updates(config) > 0)
         fill = stage1.reuse(source, env, config.stage1.features, every_seed)
+        _require_kind(source, stage1_of(config), pretrain_updates(config) > 0)
     unread = unread_options(config, env)
     if unread:
         say(f"not read by --agent {config.agent} on {env.name}: {', '.join(unread)}")

@@ -232,7 +232,7 @@ def test_a_stored_configuration_comes_back() -> None:
     (["--agent", "best"], "--agent"),
     (["--dqn.batch-episodes", "7"], "--dqn.batch-episodes"),
     (["--steps", "-5"], "--steps"),
-    (["--steps", "2000"], "more than the 2000 of the warm-up"),
+    (["--agent", "base", "--steps", "2000"], "more than the 2000 of the warm-up"),
     (["--stage1.heldout-episodes", "1"], "--stage1.heldout-episodes"),
     (["--stage1.data", "demonstrations"], "--stage1.data"),
     (["--stage1.data", "demonstrations", "--stage1.state-bound", "conditional"], "--stage1.state-bound"),
@@ -270,7 +270,7 @@ def test_a_representation_of_another_domain_is_refused(whole_run: pathlib.Path, 
     (["--resume", "RUN", "other"], "--resume: got 'other'"),
     (["--agent", "base", "--representation", "RUN"], "--agent base looks through no features here"),
     (["--stage1.features", "16", "--representation", "RUN"], "holds features 32 wide, wanted --stage1.features 16"),
-    (["--dqn.pretrain-updates", "9", "--representation", "RUN"], "--stage1.episodes: got '500 (random)', accepted: 12"),
+    (["--dqn.pretrain-updates", "9", "--representation", "RUN"], "--stage1.episodes: got '150 (random)', accepted: 12"),
 ])
 def test_what_does_not_go_with_a_run_is_refused(
     whole_run: pathlib.Path, arguments: list[str], named: str, tmp_path: pathlib.Path,

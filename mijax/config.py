@@ -12,7 +12,7 @@ MemoryName = Literal["auto", "gpt", "gru", "mlp"]
 CriticInput = Literal["state", "history_state"]
 """What an asymmetric critic sees beside the action: s, or h and s."""
 PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
-IntrinsicForm = Literal["explained_variance", "cosine"]
+IntrinsicForm = Literal["explained_variance", "cosine", "log_likelihood"]
 LowerBound = Literal["jensen_shannon", "variables"]
 StateBound = Literal["jensen_shannon", "conditional"]
 EstimatorView = Literal["features", "directions"]
@@ -327,8 +327,9 @@ class InformationConfig:
     """Weight of the memory branch's prediction of z_s, in fractions of the variance of z_s."""
     intrinsic_weight: float = 0.5
     """alpha: weight of the information bonus in the total reward."""
-    intrinsic_form: IntrinsicForm = "explained_variance"
-    """How the bonus measures the information gained about z_s in one step."""
+    intrinsic_form: IntrinsicForm = "log_likelihood"
+    """How the bonus measures the information gained about z_s in one step: by the ratio of Eq. 4, by the share of the
+    variance of z_s that is explained, or by the paper's cosines."""
     folds: int = 1
     """Models f: 1, or 2 that are each trained on half of the episodes and pay the bonus on the other half."""
     start_from_psi: bool = True

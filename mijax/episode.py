@@ -12,8 +12,8 @@ import numpy as np
 
 from envs_mjx.base import DiscreteActions, EnvState, TimeStep
 from mijax.learner import Learner, LearnerState
-from mijax.losses import information as info
 from mijax.nets.encoders import encoder_for
+from mijax.nets.two_branch import Prediction
 from mijax.types import Representation, Tokens
 
 
@@ -142,12 +142,8 @@ def _information(
         result["explained_by_agent"] = explained(representation.destandardise(predicted))
     model = learner.agent.information_model
     if model is not None:
-        guesses = [cast(jax.Array, model.apply({"params": params}, tokens)) for params in state.agent.params["f"]]
-        f = representation.destandardise(sum(guesses[1:], guesses[0]) / len(guesses))
-        f_t, f_tm1 = f[:, 1:], f[:, :-1]
-        if learner.config.information.intrinsic_form == "cosine":
-            bonus = info.cosine_bonus(z_s[:, 1:], f_t, f_tm1)
-        else:
-            bonus = info.explained_variance_bonus(z_s[:, 1:], f_t, f_tm1, representation.z_s_variance)
-        result |= {"bonus": jnp.pad(bonus, ((0, 0), (1, 0))), "explained": explained(f)}
+        guesses = [model.apply({"params": params}, tokens) for params in state.agent.params["f"]]
+        f = cast(Prediction, jax.tree.map(lambda *guess: sum(guess[1:], guess[0]) / len(guess), *guesses))
+        bonus = jnp.where(tokens.position > 0, learner.agent.bonus(f, z_s, representation), 0.0)
+        result |= {"bonus": bonus, "explained": explained(representation.destandardise(f.mean))}
     return result

@@ -1,6 +1,7 @@
 """The Double-DQN core against targets worked out by loops over an episode."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -14,7 +15,8 @@ from mijax.config import Config, ConfigError, DQNConfig, InformationConfig, Stag
 
 CONFIG = Config(
     memory="gru", stage1=Stage1Config(features=FEATURES), network=TINY, dqn=DQNConfig(discount=0.9, target_rate=0.1),
-    information=InformationConfig(intrinsic_weight=0.5, auxiliary_weight=0.25, folds=2),
+    information=InformationConfig(
+        intrinsic_weight=0.5, auxiliary_weight=0.25, folds=2, intrinsic_form="explained_variance"),
 )
 BASE = dataclasses.replace(CONFIG, agent="base")
 SHAPES = Shapes(DISCRETE)
@@ -74,30 +76,41 @@ def test_td_loss_by_hand(
     assert float(metrics["train/bonus"]) == 0
 
 
-@pytest.mark.parametrize("form", ["explained_variance", "cosine"])
+@pytest.mark.parametrize("form", ["explained_variance", "cosine", "log_likelihood"])
 def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: Any):
     config = dataclasses.replace(CONFIG, information=dataclasses.replace(CONFIG.information, intrinsic_form=form))
-    agent, state, tokens, rep = agent_of(config), states["mi"], episodes(DISCRETE), representation(SHAPES)
+    state = AgentCase(make_dqn, DISCRETE, config).state if form == "log_likelihood" else states["mi"]
+    agent, tokens, rep = agent_of(config), episodes(DISCRETE), representation(SHAPES)
     assert agent.information_model is not None
     network: Any = jax.jit(agent.network.apply)
     online, averaged = (network({"params": p}, tokens) for p in (state.params["agent"], state.target))
     q, k, q_target = online.q, online.z_s, averaged.q
     model: Any = jax.jit(agent.information_model.apply)
-    outputs = [k, *(model({"params": params}, tokens) for params in state.params["f"])]  # row i is fold i
-    k, *f = (np.arange(FEATURES) + np.sqrt(2) * np.asarray(x) for x in outputs)  # in units of z_s
+    believed = [model({"params": params}, tokens) for params in state.params["f"]]  # row i is fold i
+    k, *f = (np.arange(FEATURES) + np.sqrt(2) * np.asarray(x) for x in (k, *(b.mean for b in believed)))  # units of z_s
     z = np.asarray(tokens.z_s)
+
+    def nats(x: np.ndarray, mean: np.ndarray, log_variance: float) -> float:
+        return -(log_variance + np.sum((x - mean) ** 2) / 2.0 / math.exp(log_variance)) / 2
 
     def cosine(x: np.ndarray, y: np.ndarray) -> float:
         return float(x @ y / np.linalg.norm(x) / np.linalg.norm(y))
 
-    bonus, errors_f, errors_k = np.zeros((2, ROW)), [], []
+    bonus, errors_f, errors_k, errors_variance = np.zeros((2, ROW)), [], [], []
     for row, first, end in SPANS:
         for t in range(first, end):
             errors_f.append(np.sum((z[row, t] - f[row][row, t]) ** 2) / 2.0)
             unseen = f[1 - row][row]  # the bonus comes from the model that is not trained on this episode
             errors_k.append(np.sum((z[row, t] - k[row, t]) ** 2) / 2.0)
+            if form == "log_likelihood":
+                errors_variance.append(-nats(z[row, t], f[row][row, t], float(believed[row].log_variance[row, t])))
             if t > first and form == "cosine":
                 bonus[row, t] = 0.5 * (cosine(z[row, t], unseen[t]) - cosine(z[row, t], unseen[t - 1]))
+            elif t > first and form == "log_likelihood":
+                before, after = (
+                    max(nats(z[row, t], unseen[i], float(believed[1 - row].log_variance[row, i])) / math.log(10), -1)
+                    for i in (t - 1, t))
+                bonus[row, t] = 0.5 * (after - before)
             elif t > first:
                 before, after = (np.sum((z[row, t] - unseen[i]) ** 2) for i in (t - 1, t))
                 bonus[row, t] = 0.5 * (before - after) / 2.0
@@ -107,7 +120,8 @@ def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: A
     assert float(metrics["loss/auxiliary"]) == pytest.approx(np.mean(errors_k), rel=1e-4)
     assert float(metrics["loss/td"]) == pytest.approx(expected, rel=1e-4)
     assert float(metrics["train/bonus"]) == pytest.approx(bonus.sum() / len(SPANS), rel=1e-3, abs=1e-6)
-    assert float(loss) == pytest.approx(expected + np.mean(errors_f) + 0.25 * np.mean(errors_k), rel=1e-4)
+    total = expected + np.mean(errors_f) + 0.25 * np.mean(errors_k) + np.mean(errors_variance or [0.0])
+    assert float(loss) == pytest.approx(total, rel=1e-4)
 
 
 def test_f_learns_from_its_own_loss_only(states: dict[str, AgentState]):

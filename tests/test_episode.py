@@ -14,7 +14,7 @@ from PIL import Image
 from envs_mjx import registry
 from mijax import page, report
 from mijax.checkpoint import Checkpoints
-from mijax.config import Config, DQNConfig, EvaluationConfig, NetworkConfig, Stage1Config
+from mijax.config import Config, DQNConfig, EvaluationConfig, InformationConfig, NetworkConfig, Stage1Config
 from mijax.episode import Trace, trace
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.representation import learn_representation
@@ -32,6 +32,7 @@ CONFIG = Config(
     network=NetworkConfig(action_embedding=4, observation_embedding=4, gru_width=8, critic_hidden=(16,),
                           auxiliary_hidden=(8,)),
     dqn=DQNConfig(batch_episodes=4, warmup_episodes=4, replay_steps=400), evaluation=EvaluationConfig(every=20),
+    information=InformationConfig(intrinsic_form="explained_variance"),
 )
 pytestmark = pytest.mark.lenient
 

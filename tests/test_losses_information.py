@@ -1,5 +1,7 @@
 """Losses and rewards on the privileged features against plain loops."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,6 +102,46 @@ def test_finding_out_a_binary_variable_earns_one():
     assert np.mean(earned) == pytest.approx(1, rel=1e-5)
 
 
+def test_log_likelihood_bonus_by_hand():
+    z, f, before = jnp.array([1.0, 0.0]), jnp.array([1.0, 1.0]), jnp.array([0.0, 2.0])
+    nats = -(math.log(0.25) + (1 / 2) / 0.25) / 2 + (math.log(1.0) + (5 / 2) / 1.0) / 2
+    bonus = info.log_likelihood_bonus(z, f, before, jnp.log(0.25), jnp.log(1.0), 2.0)
+    assert float(bonus) == pytest.approx(nats / (math.log(100) / 2), rel=1e-5)
+
+
+def test_log_likelihood_bonus_pays_for_a_value_that_was_expected():
+    """Three values on a line: the middle one is their mean, which f predicts before it knows."""
+    values = jnp.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    mean, variance = values.mean(0), jnp.var(values, axis=0).sum()
+    sure, unsure = jnp.asarray(info.LEAST_LOG_VARIANCE), jnp.zeros(())
+    explained = [float(info.explained_variance_bonus(z, z, mean, variance)) for z in values]
+    gained = [float(info.log_likelihood_bonus(z, z, mean, sure, unsure, variance)) for z in values]
+    np.testing.assert_allclose(explained, [1.5, 0.0, 1.5], atol=1e-6)
+    np.testing.assert_allclose(gained, [1 + 0.75 / math.log(10), 1.0, 1 + 0.75 / math.log(10)], rtol=1e-5)
+
+
+def test_log_likelihood_bonus_of_sure_errors_is_bounded():
+    z, sure = jnp.array([3.0, 0.0]), jnp.asarray(info.LEAST_LOG_VARIANCE)
+    assert float(info.log_likelihood_bonus(z, -z, z, sure, sure, 1.0)) == pytest.approx(-2)
+    assert float(info.log_likelihood_bonus(z, z, -z, sure, sure, 1.0)) == pytest.approx(2)
+
+
+def test_variance_nll_is_least_at_the_error_and_moves_the_variance_alone():
+    z, f, mask = random_features(15, 6, 3), random_features(16, 6, 3), jnp.arange(6) < 4
+    variance = 2.0
+    error = jnp.sum(jnp.square(z - f), axis=-1) / variance
+
+    def nll(f: jax.Array, log_variance: jax.Array, z: jax.Array) -> jax.Array:
+        return info.variance_nll(f, log_variance, z, mask, variance)
+
+    of_f, of_best, of_z = jax.grad(nll, argnums=(0, 1, 2))(f, jnp.log(error), z)
+    assert not of_f.any()
+    assert not of_z.any()
+    np.testing.assert_allclose(of_best, 0, atol=1e-6)
+    assert float(nll(f, jnp.log(error), z)) == pytest.approx(float(jnp.mean(jnp.log(error[:4]) + 1) / 2), rel=1e-5)
+    assert float(nll(f, jnp.log(error) + 0.3, z)) > float(nll(f, jnp.log(error), z))
+
+
 def test_shapes_that_would_broadcast_are_errors():
     z, row, mask = jnp.zeros((3, 4)), jnp.zeros((1, 4)), jnp.ones(3, bool)
     for call in (
@@ -112,6 +154,9 @@ def test_shapes_that_would_broadcast_are_errors():
         lambda: info.cosine_bonus(row, z, z),
         lambda: info.explained_variance_bonus(z, row, z, 1.0),
         lambda: info.explained_variance_bonus(row, z, z, 1.0),
+        lambda: info.log_likelihood_bonus(z, row, z, jnp.zeros(3), jnp.zeros(3), 1.0),
+        lambda: info.log_likelihood_bonus(z, z, z, jnp.zeros(1), jnp.zeros(3), 1.0),
+        lambda: info.variance_nll(z, jnp.zeros(1), z, mask),
     ):
         with pytest.raises(AssertionError):
             call()

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol, cast
 
 import jax
@@ -15,7 +15,7 @@ from mijax.agents.variants import Variant, memory_of
 from mijax.config import Config, DQNConfig, SACConfig
 from mijax.losses import information as info
 from mijax.losses.belief import negative_elbo
-from mijax.nets.two_branch import InformationModel, MemoryState
+from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, Prediction
 from mijax.types import Metrics, Params, Representation, Tokens
 
 
@@ -232,28 +232,38 @@ class Agent(abc.ABC):
         episodes without any information it explained 0.83 of z_s (measured, Heaven-Hell, 12 000 steps), and the bonus
         then pays for wandering about. The bonus of an episode's first token is meaningless; no target uses it.
         """
-        options, variance, z_s = self.config.information, representation.z_s_variance, cast(jax.Array, tokens.z_s)
+        variance, z_s = representation.z_s_variance, cast(jax.Array, tokens.z_s)
         real = tokens.segment > 0
         folds = tokens.folds() if len(params) == 2 else (tokens,)
         keys = jax.random.split(key, len(params))
-        f = representation.destandardise(jnp.concatenate([
-            self._apply(self.information_model, *arguments) for arguments in zip(params, folds, keys, strict=True)]))
-        loss_f, parts_f = info.prediction_mse(f, z_s, real, variance)
-        if self._exact and len(params) == 1:
-            f_t = jax.lax.stop_gradient(f)
-        else:
-            f_t = jnp.concatenate([
-                self._clean(self.information_model, *arguments) for arguments in zip(params[::-1], folds, strict=True)])
-            f_t = jax.lax.stop_gradient(representation.destandardise(f_t))
-        f_tm1 = jnp.roll(f_t, 1, axis=1)
-        if options.intrinsic_form == "cosine":
-            bonus = info.cosine_bonus(z_s, f_t, f_tm1)
-        else:
-            bonus = info.explained_variance_bonus(z_s, f_t, f_tm1, variance)
+        f = _concatenate(
+            self._apply(self.information_model, *arguments) for arguments in zip(params, folds, keys, strict=True))
+        loss_f, parts_f = info.prediction_mse(representation.destandardise(f.mean), z_s, real, variance)
         metrics = {"loss/f": loss_f, "f/explained": parts_f["explained"]}
+        f_t = f
+        if not self._exact or len(params) == 2:
+            f_t = _concatenate(
+                self._clean(self.information_model, *arguments) for arguments in zip(params[::-1], folds, strict=True))
+        f_t = jax.lax.stop_gradient(f_t)
         if len(params) == 2:
-            metrics["f/explained_unseen"] = info.prediction_mse(f_t, z_s, real, variance)[1]["explained"]
-        return loss_f, options.intrinsic_weight * bonus, metrics
+            unseen = info.prediction_mse(representation.destandardise(f_t.mean), z_s, real, variance)
+            metrics["f/explained_unseen"] = unseen[1]["explained"]
+        if f.log_variance is not None:
+            nll = info.variance_nll(representation.destandardise(f.mean), f.log_variance, z_s, real, variance)
+            loss_f, metrics = loss_f + nll, metrics | {"loss/f_variance": nll}
+        return loss_f, self.config.information.intrinsic_weight * self.bonus(f_t, z_s, representation), metrics
+
+    def bonus(self, f: Prediction, z_s: jax.Array, representation: Representation) -> jax.Array:
+        """(R, L) information gained about z_s (R, L, F) on arriving at each token; of a first token meaningless."""
+        form, variance = self.config.information.intrinsic_form, representation.z_s_variance
+        f_t = representation.destandardise(f.mean)
+        f_tm1 = jnp.roll(f_t, 1, axis=1)
+        if form == "cosine":
+            return info.cosine_bonus(z_s, f_t, f_tm1)
+        if form == "explained_variance":
+            return info.explained_variance_bonus(z_s, f_t, f_tm1, variance)
+        log_variance = cast(jax.Array, f.log_variance)
+        return info.log_likelihood_bonus(z_s, f_t, f_tm1, log_variance, jnp.roll(log_variance, 1, axis=1), variance)
 
     def _auxiliary(
         self, online: Sequence[Heads], averaged: Sequence[Heads], tokens: Tokens, representation: Representation | None
@@ -318,3 +328,16 @@ def adam(options: DQNConfig | SACConfig, updates: int) -> optax.GradientTransfor
     rate = optax.linear_schedule(
         options.learning_rate, options.learning_rate * options.final_learning_rate, updates)
     return optax.adam(rate)
+
+
+def _concatenate(predictions: Iterable[Prediction]) -> Prediction:
+    """Of all folds, along their rows."""
+    return cast(Prediction, jax.tree.map(lambda *rows: jnp.concatenate(rows), *predictions))
+
+
+def make_information_model(config: Config, top: HistoryEncoder) -> InformationModel | None:
+    """f for an informed agent whose memory branch is `top`; None where there is no bonus."""
+    if config.information.intrinsic_weight == 0:
+        return None
+    return InformationModel(
+        top.clone(), config.stage1.features, has_variance=config.information.intrinsic_form == "log_likelihood")

@@ -8,14 +8,23 @@ import jax
 import jax.numpy as jnp
 
 from envs_mjx.base import DiscreteActions, Environment
-from mijax.agents.core import Agent, AgentState, Heads, adam, episode_mean, may_follow, transitions
+from mijax.agents.core import (
+    Agent,
+    AgentState,
+    Heads,
+    adam,
+    episode_mean,
+    make_information_model,
+    may_follow,
+    transitions,
+)
 from mijax.agents.variants import Variant, memory_of, pretrain_updates, variant
 from mijax.config import Config, ConfigError, DQNConfig
 from mijax.losses import td
 from mijax.losses.returns import traced_returns
 from mijax.nets.belief import BeliefQ
 from mijax.nets.privileged import PrivilegedQ
-from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, Outputs, TwoBranchQ
+from mijax.nets.two_branch import HistoryEncoder, MemoryState, Outputs, TwoBranchQ
 from mijax.types import Metrics, Params, Representation, Tokens
 
 __all__ = ["DQN", "AgentState", "make_dqn"]
@@ -186,7 +195,7 @@ def make_dqn(env: Environment, config: Config) -> DQN:
     declaration = variant(config.agent)
     network = _network(env, config, declaration)
     updates = pretrain_updates(config) + config.dqn.updates_in(config.steps)
-    information_model = None
-    if declaration.informed and config.information.intrinsic_weight > 0:
-        information_model = InformationModel(cast(TwoBranchQ, network).top.clone(), config.stage1.features)
-    return DQN(env, config, declaration, network, information_model, adam(config.dqn, updates))
+    model = None
+    if declaration.informed:
+        model = make_information_model(config, cast(TwoBranchQ, network).top)
+    return DQN(env, config, declaration, network, model, adam(config.dqn, updates))

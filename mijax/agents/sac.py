@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import optax
 
 from envs_mjx.base import ArraySpec, ContinuousActions, Environment
-from mijax.agents.core import Agent, Heads, adam, episode_mean, may_follow, transitions
+from mijax.agents.core import (
+    Agent,
+    Heads,
+    adam,
+    episode_mean,
+    make_information_model,
+    may_follow,
+    transitions,
+)
 from mijax.agents.variants import Variant, memory_of, variant
 from mijax.config import Config, SACConfig
 from mijax.losses import sac
@@ -24,7 +32,7 @@ from mijax.nets.actor_critic import (
 from mijax.nets.belief import BeliefBranches
 from mijax.nets.encoders import encoder_for
 from mijax.nets.privileged import PrivilegedFeatures
-from mijax.nets.two_branch import HistoryEncoder, InformationModel, MemoryState, TwoBranch
+from mijax.nets.two_branch import HistoryEncoder, MemoryState, TwoBranch
 from mijax.types import Metrics, Params, Representation, Tokens
 
 
@@ -312,6 +320,6 @@ def make_sac(env: Environment, config: Config) -> SAC:
     """The agent that a configuration names, for an environment with continuous actions."""
     declaration = variant(config.agent)
     network, model = _network(env, config, declaration), None
-    if declaration.informed and config.information.intrinsic_weight > 0:
-        model = InformationModel(cast(TwoBranchActorCritic, network).actor.top.clone(), config.stage1.features)
+    if declaration.informed:
+        model = make_information_model(config, cast(TwoBranchActorCritic, network).actor.top)
     return SAC(env, config, declaration, network, model, adam(config.sac, config.sac.updates_in(config.steps)))

@@ -8,8 +8,10 @@ from mijax.losses.information import (
     cosine,
     cosine_bonus,
     explained_variance_bonus,
+    log_likelihood_bonus,
     prediction_cosine,
     prediction_mse,
+    variance_nll,
 )
 from mijax.losses.masks import masked_mean
 from mijax.losses.returns import traced_returns
@@ -39,6 +41,7 @@ __all__ = [
     "imitation_loss",
     "is_greedy",
     "kl_standard_normal",
+    "log_likelihood_bonus",
     "masked_mean",
     "negative_elbo",
     "next_feature_loss",
@@ -51,4 +54,5 @@ __all__ = [
     "temperature_loss",
     "traced_returns",
     "variables_loss",
+    "variance_nll",
 ]

@@ -3,10 +3,13 @@
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mijax.losses.masks import masked_mean
 
 _EPS = 1e-8
+LEAST_LOG_VARIANCE = float(np.log(0.01))
+"""Of what f is believed to leave unexplained of z_s, in fractions of Tr Var(z_s): below it nothing more is earned."""
 
 
 def prediction_mse(
@@ -90,3 +93,60 @@ def explained_variance_bonus(
     before = jnp.sum(jnp.square(z_s_t - f_tm1), axis=-1)
     after = jnp.sum(jnp.square(z_s_t - f_t), axis=-1)
     return (before - after) / variance
+
+
+def variance_nll(
+    predicted: jax.Array, log_variance: jax.Array, z_s: jax.Array, mask: jax.Array, variance: jax.Array | float = 1.0
+) -> jax.Array:
+    """-E[ log f(z_s | h) ] of Eq. 5 as a loss of the variance of f alone, whose mean `prediction_mse` fits.
+
+    Args:
+        predicted: (..., F) f(h), the mean; no gradient flows into it.
+        log_variance: (...) log of E|z_s - f(h)|^2, in fractions of `variance`.
+        z_s: (..., F) phi(s); no gradient flows into it.
+        mask: (...) bool, which entries count.
+        variance: () Tr Var(z_s).
+
+    Returns:
+        () loss; least where the variance is that of the error.
+    """
+    return -masked_mean(_log_likelihood(
+        jax.lax.stop_gradient(predicted), log_variance, jax.lax.stop_gradient(z_s), variance), mask)
+
+
+def log_likelihood_bonus(
+    z_s_t: jax.Array, f_t: jax.Array, f_tm1: jax.Array, log_variance_t: jax.Array, log_variance_tm1: jax.Array,
+    variance: jax.Array | float,
+) -> jax.Array:
+    """The third term of Eq. 4, log f(z_t | h_t) - log f(z_t | h_{t-1}), of a Gaussian that knows how sure it is.
+
+    In units of what is earned by becoming sure, log(1 / 0.01) / 2 nats: about 1 for an episode in which z_s is
+    revealed, also where it is what f expects of all episodes, for which the other two forms pay nothing. Errors count
+    as if z_s had one dimension, and a log-likelihood below -1 in these units counts as -1: f can be surely wrong.
+
+    Args:
+        z_s_t: (..., F) phi(s_t).
+        f_t: (..., F) mean of f(. | h_t).
+        f_tm1: (..., F) mean of f(. | h_{t-1}).
+        log_variance_t: (...) log of E|z_t - f_t|^2, in fractions of `variance`, at least `LEAST_LOG_VARIANCE`.
+        log_variance_tm1: (...) the same of h_{t-1}.
+        variance: () Tr Var(z_s).
+
+    Returns:
+        (...) bonus; for a z_s constant in an episode it sums to the information gained between the first and last step.
+    """
+    chex.assert_equal_shape([z_s_t, f_t, f_tm1])
+    later = _log_likelihood(f_t, log_variance_t, z_s_t, variance)
+    earlier = _log_likelihood(f_tm1, log_variance_tm1, z_s_t, variance)
+    unit = -LEAST_LOG_VARIANCE / 2
+    return jnp.maximum(later / unit, -1.0) - jnp.maximum(earlier / unit, -1.0)
+
+
+def _log_likelihood(
+    mean: jax.Array, log_variance: jax.Array, z_s: jax.Array, variance: jax.Array | float
+) -> jax.Array:
+    """(...) nats, without the constant."""
+    chex.assert_equal_shape([mean, z_s])
+    chex.assert_equal_shape_prefix([mean, log_variance], log_variance.ndim)
+    error = jnp.sum(jnp.square(z_s - mean), axis=-1) / variance
+    return -(log_variance + error * jnp.exp(-log_variance)) / 2

@@ -10,6 +10,7 @@ from flax import struct
 from envs_mjx.base import ArraySpec
 from mijax.config import CriticInput, MemoryKind, NetworkConfig
 from mijax.frames import FrameTable, keep_present, take
+from mijax.losses.information import LEAST_LOG_VARIANCE
 from mijax.nets.encoders import Encoder, encoder_for
 from mijax.nets.gpt import GPT
 from mijax.nets.gru import GRU
@@ -223,16 +224,32 @@ def own_encoder(spec: ArraySpec, dtype: jnp.dtype) -> ObservationEmbedder:
     return ObservationEmbedder(100 if spec.is_image else 128, dtype)
 
 
+@struct.dataclass
+class Prediction:
+    """A Gaussian over z_s at every token, in the units of its spread over the training set."""
+
+    mean: jax.Array  # (R, L, F)
+    log_variance: jax.Array | None = None  # (R, L) log of E|z_s - mean|^2, at most 0; None where it is not modelled
+
+
 class InformationModel(nn.Module):
-    """f(h): the mean of a Gaussian over z_s given the history (paper Eq. 4, 5). A network of its own."""
+    """f(h): a Gaussian over z_s given the history (paper Eq. 4, 5). A network of its own."""
 
     history: HistoryEncoder
     features: int
+    has_variance: bool = False
+    """Whether the variance is learnt too, which the bonus `log_likelihood` needs."""
 
     def setup(self) -> None:
         self.head = _state_head(self.history.network, self.features)
+        if self.has_variance:
+            self.variance_head = _state_head(self.history.network, 1)
 
-    def __call__(self, tokens: Tokens, deterministic: bool = True) -> jax.Array:
-        """(R, L, F) the expected z_s at every token."""
-        expected = self.head(self.history(tokens, deterministic)).astype(jnp.float32)
-        return expected.reshape(*tokens.segment.shape, self.features)
+    def __call__(self, tokens: Tokens, deterministic: bool = True) -> Prediction:
+        """What is known about z_s at every token. The variance has no gradient on the history's encoder."""
+        summary = self.history(tokens, deterministic)
+        mean = self.head(summary).astype(jnp.float32).reshape(*tokens.segment.shape, self.features)
+        if not self.has_variance:
+            return Prediction(mean)
+        x = self.variance_head(jax.lax.stop_gradient(summary)).astype(jnp.float32).reshape(tokens.segment.shape)
+        return Prediction(mean, LEAST_LOG_VARIANCE * jax.nn.sigmoid(x - 3))  # begins near that of a guess, 0

@@ -90,7 +90,8 @@ class ProbeReport:
     """`variance` Tr Var(z_s); `hidden_share` of it between values of the hidden variables; `cosine` mean and
     `cosine_max` largest cosine between the mean z_s of two hidden values."""
     bonus: dict[str, float]
-    """What an episode can earn with weight 1 by learning all, by form of the intrinsic reward."""
+    """What an episode can earn with weight 1 by learning all, by form of the intrinsic reward; and
+    `explained_variance_least`, what it earns with the hidden value that pays least."""
     p1_failures: tuple[str, ...]
     p2_failures: tuple[str, ...]
 
@@ -317,7 +318,8 @@ def _geometry(
     count = np.bincount(group)
     centers = np.stack([np.bincount(group, z_s[:, f]) for f in range(z_s.shape[1])], axis=1) / count[:, None]
     variance = float(np.sum(z_s.var(0)))
-    between = float(np.sum((count / len(group)) @ (centers - z_s.mean(0)) ** 2))
+    distance = np.sum((centers - z_s.mean(0)) ** 2, axis=1)
+    between = float((count / len(group)) @ distance)
     unit = centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-12)
     cosines = (unit @ unit.T)[np.triu_indices(len(unit), 1)]
     lengths = np.linalg.norm(z_s, axis=1) * np.linalg.norm(mean)
@@ -327,8 +329,10 @@ def _geometry(
                 "cosine": float(cosines.mean()) if len(cosines) else 1.0,
                 "cosine_max": float(cosines.max()) if len(cosines) else 1.0}
     # Before information f predicts the mean, after it z_s itself. Explained variance sums to 1 times what the hidden
-    # variables explain: the rest of z_s, if any, is seen without gathering information.
-    return geometry, {"cosine": float(1 - prior_cosine), "explained_variance": share}
+    # variables explain: the rest of z_s, if any, is seen without gathering information. A hidden value whose z_s is the
+    # mean of all earns nothing, which the mean over values does not show.
+    return geometry, {"cosine": float(1 - prior_cosine), "explained_variance": share,
+                      "explained_variance_least": float(distance.min() / variance) if variance > 0 else 0.0}
 
 
 def _verdicts(

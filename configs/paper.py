@@ -13,7 +13,8 @@ INTRINSIC_WEIGHT = {"heaven_hell": 10.0, "sphinx": 10.0, "carflag_2d": 0.0} | di
 STEPS = {"heaven_hell": 500_000, "sphinx": 500_000, "carflag_2d": 1_000_000} | dict.fromkeys(ROBOTS, 40_000)
 """10 000, 20 000 and 800 episodes of 50 steps."""
 EPOCHS = 1000
-TABLE_3 = {"sphinx": {"learning_rate": 1e-3},
+TABLE_3 = {"heaven_hell": {"episodes": 500},
+           "sphinx": {"learning_rate": 1e-3},
            "carflag_2d": {"learning_rate": 1e-3, "lambda_r": 1.0, "lambda_o": 5.0, "lambda_club": 10.0,
                           "lambda_dim_s": 0.0},
            "block_pulling": {"learning_rate": 1e-3, "batch_size": 500, "lambda_r": 10.0, "lambda_s": 0.1,

@@ -11,7 +11,6 @@ import pytest
 
 import configs
 import envs_mjx.robot
-from configs.paper import paper
 from envs_mjx import registry
 from envs_mjx.robot import BlockPulling, BlockPushing, DrawerOpening, drawer_opening, scene, window
 from envs_mjx.robot.blocks import square_gap
@@ -76,19 +75,6 @@ def largest_object_error(env: RobotTask, trajectory: Trajectory, places: np.ndar
     """Metres: between the movable object's joint positions in MJX and in C, over an episode. Yaw does not count."""
     slides = slice(4, 6) if env.physics.model.nq > 5 else slice(4, 5)
     return float(np.abs(np.asarray(trajectory.states.qpos)[: len(places), slides] - places[:, slides]).max())
-
-
-@pytest.mark.parametrize("domain", DOMAINS)
-def test_the_papers_preset_is_table_3(domain: str) -> None:
-    stage1 = paper(configs.preset(domain), vector_observation=False).stage1
-    got = (stage1.lambda_r, stage1.lambda_s, stage1.lambda_o, stage1.lambda_club, stage1.lambda_dim_s,
-           stage1.lambda_dim_o, stage1.learning_rate, stage1.episodes, stage1.epochs, stage1.batch_size)
-    weights = {"block_pulling": (10.0, 0.1, 1.0, 10.0, 0.1), "block_pushing": (100.0, 1.0, 1.0, 0.001, 0.01),
-               "drawer_opening": (100.0, 1.0, 1.0, 1.0, 0.001)}
-    assert got == (*weights[domain], 1.0, 0.001, 80, 1000, 500)
-    copies = {"block_pulling": 4, "block_pushing": 12, "drawer_opening": 6}
-    assert (stage1.data, stage1.copies) == ("demonstrations", copies[domain])
-    assert configs.preset(domain).domain == domain
 
 
 # Geometry

@@ -27,7 +27,7 @@ from envs_mjx import registry
 from envs_mjx.base import ContinuousActions
 from launch.experiments import DOMAINS, EXPERIMENTS, Arm
 from mijax import draw_episode, episode, figures, runtime, stage1, tables, train
-from mijax.agents.variants import needs_representation, stage1_of, unread_groups
+from mijax.agents.variants import needs_representation, reads, stage1_of
 from mijax.config import Config, ConfigError, options_of, parse_seeds, require
 from mijax.learner import make_learner
 from mijax.representation.dataset import collect
@@ -111,10 +111,9 @@ def check_same(run: RunFolder, options: train.TrainOptions) -> None:
     """Raise `RunError` if a run was made with other options than it would be now, as far as its agent reads them."""
     there, wanted = map(options_of, (training_of(run).config, options.config))
     free = ("memory", "seeds.strategy")  # resolved from `auto` when stored; not meant to change what is learnt
-    actions = registry.make(options.config.domain).action_spec
-    unread = unread_groups(options.config, continuous=isinstance(actions, ContinuousActions))
+    continuous = isinstance(registry.make(options.config.domain).action_spec, ContinuousActions)
     other = [name for name, value in wanted.items()
-             if there[name] != value and name not in free and name.split(".")[0] not in unread]
+             if there[name] != value and name not in free and reads(options.config, continuous, name)]
     if other:
         raise RunError(f"{run.path}: was made with --{other[0].replace('_', '-')} {there[other[0]]}, wanted "
                        f"{wanted[other[0]]}; choose another --out")

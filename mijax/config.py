@@ -223,7 +223,7 @@ class DQNConfig:
             require(0 <= value <= 1, f"dqn.{name}".replace("_", "-"), value, "a number in [0, 1]")
 
     def updates_in(self, steps: int) -> int:
-        """Gradient updates of a run of so many environment steps."""
+        """Gradient updates while an agent takes so many environment steps; without those before its first."""
         return max(1, round(steps * self.updates_per_step))
 
 
@@ -315,7 +315,7 @@ class SACConfig:
         return self.trunk in ("psi", "z_o")
 
     def updates_in(self, steps: int) -> int:
-        """Gradient updates of a run of so many environment steps."""
+        """Gradient updates of a run of so many environment steps; with those before its first."""
         return self.pretrain_updates + max(1, round(steps * self.updates_per_step))
 
 
@@ -493,6 +493,9 @@ def _build(kind: Any, values: Mapping[str, Any], prefix: str) -> Any:
     for name, value in values.items():
         if dataclasses.is_dataclass(types[name]):
             value = _build(types[name], value, f"{prefix}{name}.")
+        if typing.get_origin(types[name]) is Literal:
+            accepted = typing.get_args(types[name])
+            require(value in accepted, f"{prefix}{name}".replace("_", "-"), value, ", ".join(accepted))
         built[name] = tuple(value) if isinstance(value, list) else value
     return kind(**built)
 
@@ -500,7 +503,7 @@ def _build(kind: Any, values: Mapping[str, Any], prefix: str) -> Any:
 def parse_seeds(text: str) -> tuple[int, ...]:
     """`5` -> (0, 1, 2, 3, 4); `3,7` -> (3, 7); `3,` -> (3,)."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
-    valid = bool(parts) and all(part.isdigit() for part in parts)
+    valid = bool(parts) and all(part.isdecimal() for part in parts)
     require(valid, "seeds", text, "a number of seeds such as 5, or a list such as 3,7")
     numbers = tuple(int(part) for part in parts)
     if "," not in text:

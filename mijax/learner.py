@@ -23,7 +23,7 @@ from mijax.agents.variants import variant
 from mijax.augmentation import draw_copies, show_copy, show_tokens
 from mijax.config import Config
 from mijax.frames import FrameTable
-from mijax.nets.actor_critic import shown
+from mijax.nets.actor_critic import without_blank
 from mijax.nets.encoders import encoder_for
 from mijax.packing import Layout, fit_folds, gather_rows, one_per_row, row_choices, stack_folds
 from mijax.replay import Replay, StepRecord, fill, init_replay, returns_of, sample_episodes, write
@@ -159,7 +159,7 @@ class Learner:
             replay = self._remember(jax.tree.map(jnp.zeros_like, replay), state.representation)
 
         def update(agent: AgentState, key: jax.Array) -> tuple[AgentState, None]:
-            return self.update(agent, replay, state.representation, key, pretrain=True)[0], None
+            return self.update(agent, replay, state.representation, key, fits_belief=True)[0], None
 
         agent, _ = jax.lax.scan(update, state.agent, jax.random.split(key, self.config.believer.updates))
         return dataclasses.replace(agent, optimizer=self.agent.optimizer.init(agent.params))
@@ -280,7 +280,7 @@ class Learner:
                 if declaration.uses_representation:
                     z_s = cast(jax.Array, phi.apply({"params": representation.phi}, copied.state))
                 if self.agent.looks_once:
-                    seen = shown(copied.observation, self.env.observation_spec)
+                    seen = without_blank(copied.observation, self.env.observation_spec)
                     outlet = None if self.config.sac.trunk == "z_o" else "body"
                     observation, state = (
                         cast(jax.Array, encoder.apply({"params": params}, x, method=method)).astype(jnp.float16)
@@ -327,12 +327,12 @@ class Learner:
 
     def update(
         self, agent: AgentState, replay: Replay, representation: Representation | None, key: jax.Array,
-        pretrain: bool = False,
+        fits_belief: bool = False,
     ) -> tuple[AgentState, Metrics]:
-        """One gradient update on a batch of episodes, packed into as few rows as they need; `pretrain`: the agent's own
-        losses without the values'.
+        """One gradient update on a batch of episodes, packed into as few rows as they need; `fits_belief`: of
+        Believer's history model alone.
         """
-        apply: Callable = self.agent.pretrain if pretrain else self.agent.update
+        apply: Callable = self.agent.fit_belief if fits_belief else self.agent.update
         batch = self.agent.options.batch_episodes
         key_sample, key_loss = jax.random.split(key)
         share = self.config.sac.demonstration_share if self.demonstrations else 0.0

@@ -61,6 +61,8 @@ def represent(options: RepresentOptions) -> None:
     """Train, probe and keep the representation of every seed that has none yet; fine if one fails its probe."""
     require(options.search >= 0, "search", options.search, "a number >= 1, or 0 for none")
     seeds, env = parse_seeds(options.seeds), registry.make(options.domain)
+    require(not options.search or any(variable.hidden for variable in env.variables), "search", options.search,
+            f"0: {env.name} names no hidden variable, by whose decoding candidates are ranked")
     check_contract(env)
     run = open_run(options, seeds)
     with run.held(seeds):

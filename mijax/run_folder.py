@@ -2,9 +2,12 @@
 
     RUN/config.json             the run's options; the last file of a new folder, so that it marks a whole one
     RUN/versions.json           python, packages, platform, commit
+    RUN/seed_K/representation/  stage 1's encoders and what its probe found
+    RUN/seed_K/checkpoints/     the newest ones
     RUN/seed_K/metrics.jsonl    one JSON object per evaluation
     RUN/seed_K/end.json         at the seed's end: its last evaluation, and seconds that its metrics do not have
     RUN/seed_K/lock             empty: locked while a process works on the seed
+    RUN/lock                    empty: locked while one writes what is about all seeds
     RUN/summary.json            at the end: see `mijax.results.summarise`
     RUN/curve.png
 
@@ -21,6 +24,7 @@ import json
 import math
 import os
 import pathlib
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -65,10 +69,16 @@ class RunFolder:
         with _named_errors(run.path):
             run.path.mkdir(parents=True, exist_ok=True)
             started = {"versions.json", f"versions.json{ASIDE}", f"config.json{ASIDE}"}  # a killed start leaves these
-            started |= {path.parent.name for path in run.path.glob("seed_*/representation")}
+            taken_over = list(run.path.glob("seed_*/representation"))
+            started |= {path.parent.name for path in taken_over}
             foreign = sorted({entry.name for entry in run.path.iterdir()} - started)
         if foreign:
             raise RunError(f"{path}: not empty and not a run (it holds {foreign[0]}); choose another --out")
+        with _named_errors(run.path):
+            for path in taken_over:  # by a start that was killed, perhaps of other options
+                shutil.rmtree(path)
+                with contextlib.suppress(OSError):  # it holds something else
+                    path.parent.rmdir()
         if fill is not None:
             fill(run)
         _write_json(run._file("versions.json"), current_versions())

@@ -98,8 +98,8 @@ class SeedRunner:
         self._states = self._each(self._init, self._by_group(keys), self._by_group(rep))
 
     def pretrain(self, report: Callable[[int], None]) -> None:
-        """Updates on the demonstrations, where there are any: up to the first step. A chunk at a time, after which
-        `report` is told how many updates every seed has made."""
+        """The updates before the first step, on the demonstrations or on the episodes of stage 1. A chunk at a time,
+        after which `report` is told how many updates every seed has made."""
         while (left := -self._iteration) > 0:
             self._run(min(left, self.learner.iterations_per_chunk), acts=False)
             report((self.learner.pretrain_iterations + self._iteration) * self.learner.updates_per_iteration)

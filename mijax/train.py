@@ -22,7 +22,7 @@ from envs_mjx.contract import check_contract
 from envs_mjx.errors import UserError
 from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
-from mijax.agents.variants import memory_of, needs_representation, pretrain_updates, stage1_of, title_of, unread_groups
+from mijax.agents.variants import memory_of, needs_representation, pretrain_updates, reads, stage1_of, title_of
 from mijax.config import Config, Stage1Config, config_from_dict, options_of, parse_seeds, require
 from mijax.hosts import Host, check, meet
 from mijax.learner import Learner, make_learner
@@ -58,7 +58,8 @@ class TrainOptions:
     """Run folder to go on with, under its own options; only --track, --hosts and --steps may be given with it, and
     --steps stretches the schedules of step size and imitation."""
     representation: pathlib.Path | None = None
-    """Run whose stage 1 is taken over instead of training one."""
+    """Run whose stage 1 is taken over instead of training one: each seed's, or its first one's where a seed has none
+    there."""
     track: TrackerName = "none"
     """Where metrics go besides the run folder."""
     hosts: str = ""
@@ -108,10 +109,10 @@ def unread_options(config: Config, env: Environment) -> list[str]:
     """
     ours = configs.preset(config.domain)
     presets = [options_of(preset) for preset in (ours, paper(ours, not env.observation_spec.is_image))]
-    unread = unread_groups(config, continuous=isinstance(env.action_spec, ContinuousActions))
+    continuous = isinstance(env.action_spec, ContinuousActions)
     used = options_of(dataclasses.replace(config, stage1=stage1_of(config)))
     return [f"--{name.replace('_', '-')}" for name, value in options_of(config).items()
-            if (name.split(".")[0] in unread or used[name] != value)
+            if (not reads(config, continuous, name) or used[name] != value)
             and all(preset[name] != value for preset in presets)]
 
 

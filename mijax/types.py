@@ -27,7 +27,7 @@ class Representation:
     data_key: jax.Array  # (2,) uint32  data of the key that the episodes it was learnt from follow from
 
     def standardise(self, z_s: jax.Array) -> jax.Array:
-        """(..., F) features -> (..., F) with mean 0 and total variance 1."""
+        """(..., F) features -> (..., F) with mean 0 and, all divided by the same number, variances that add up to 1."""
         return (z_s - jnp.broadcast_to(self.z_s_mean, z_s.shape)) / jnp.sqrt(self.z_s_variance)
 
     def destandardise(self, z: jax.Array) -> jax.Array:

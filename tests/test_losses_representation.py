@@ -102,6 +102,8 @@ def test_dim_with_chosen_negatives_averages_each_row_over_those():
     alike = jnp.asarray(shown[:, None] == shown[None, :])
     loss = dim_jensen_shannon(jnp.asarray(scores), same, different=~same & alike)[0]
     np.testing.assert_allclose(loss, np.mean(rows), rtol=1e-5)
+    with pytest.raises(ValueError, match="different pairs need identical ones"):
+        dim_jensen_shannon(jnp.asarray(scores), different=~same & alike)
 
 
 def test_dim_reaches_its_known_optimum_and_not_more():

@@ -114,6 +114,7 @@ def test_shapes_that_would_broadcast_are_errors():
 def test_masked_mean_is_zero_when_nothing_is_valid():
     x = jnp.array([1.0, 2.0, 30.0])
     assert float(masked_mean(x, jnp.array([True, True, False]))) == 1.5
+    assert float(masked_mean(x.at[2].set(jnp.nan), jnp.array([True, True, False]))) == 1.5
     assert float(masked_mean(x, jnp.zeros(3, bool))) == 0
 
 

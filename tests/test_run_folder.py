@@ -101,7 +101,7 @@ def test_a_killed_start_can_be_started_again(tmp_path):
 
 def test_a_run_starts_with_its_representations_or_not_at_all(tmp_path):
     def killed(run: RunFolder) -> None:
-        (run.seed_path(0) / "representation").mkdir(parents=True)
+        (run.seed_path(4) / "representation").mkdir(parents=True)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -109,8 +109,9 @@ def test_a_run_starts_with_its_representations_or_not_at_all(tmp_path):
     with pytest.raises(RunError, match=r"no config\.json"):
         RunFolder.open(tmp_path)
     filled = []
-    assert RunFolder.create(tmp_path, CONFIG, filled.append).config()
-    assert filled == [RunFolder(tmp_path)]
+    run = RunFolder.create(tmp_path, CONFIG, filled.append)
+    assert filled == [run]
+    assert not run.seed_path(4).exists()
 
 
 def test_another_budget_makes_a_run_go_on(run):

@@ -122,3 +122,7 @@ def test_the_command_keeps_the_best_and_draws_them_all(tmp_path: pathlib.Path, c
     assert (214, 39, 40) in colours  # the red ring around the best
     assert represent.main(["--search", "-1", "--out", str(tmp_path / "other")]) == 1
     assert "--search: got -1, accepted: a number >= 1" in capsys.readouterr().err
+    nothing_hidden = ["--domain", "compass:Compass", "--search", "2", "--out", str(tmp_path / "other")]
+    assert represent.main(nothing_hidden) == 1
+    assert "--search: got 2, accepted: 0: compass names no hidden variable" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

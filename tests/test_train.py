@@ -225,6 +225,8 @@ def test_a_stored_configuration_comes_back() -> None:
     assert config_from_dict(json.loads(json.dumps(dataclasses.asdict(config)))) == config
     with pytest.raises(ConfigError, match=r"dqn\.wrong"):
         config_from_dict({"dqn": {"wrong": 1}})
+    with pytest.raises(ConfigError, match=r"information\.intrinsic-form: got 'most'"):
+        config_from_dict({"information": {"intrinsic_form": "most"}})
 
 
 @pytest.mark.parametrize(("arguments", "named"), [

@@ -107,6 +107,11 @@ def test_options_that_are_not_read_are_named() -> None:
     assert unread == ["--sac.discount", "--zp.weight"]
     options = train.parse(["--agent", "believer", "--stage1.lambda-club", "3", "--stage1.lambda-r", "3"])
     assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--stage1.lambda-club"]
+    options = train.parse([
+        "--agent", "believer", "--information.intrinsic-weight", "3", "--information.no-start-from-psi"])
+    assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--information.intrinsic-weight"]
+    options = train.parse(["--agent", "mdp", "--information.no-start-from-psi", "--stage1.epochs", "7"])
+    assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--information.start-from-psi"]
     assert train.unread_options(train.parse(["--preset", "paper"]).config, registry.make("heaven_hell")) == []
 
 

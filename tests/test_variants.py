@@ -144,7 +144,7 @@ def test_beliefs_stay_within_their_episode():
 def test_believers_pretraining_fits_the_belief_and_leaves_the_values():
     case = Case("believer")
     init = jax.jit(case.agent.init)(jax.random.key(0), case.representation)
-    step = jax.jit(case.agent.pretrain)
+    step = jax.jit(case.agent.fit_belief)
     state, losses = init, []
     for key in jax.random.split(jax.random.key(1), 200):
         state, metrics = step(state, case.tokens, case.representation, key)

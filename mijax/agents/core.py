@@ -39,7 +39,7 @@ class Heads(Protocol):
 
     @property
     def z_s(self) -> jax.Array | None:
-        """(R, L, F) predicted from the history, in units of its standard deviation."""
+        """(R, L, F) predicted from the history, standardised as `Representation.standardise` does."""
         ...
 
     @property
@@ -89,9 +89,9 @@ class Agent(abc.ABC):
         """Whether what the agent sees of a frame never changes, so that the replay stores that."""
         return False
 
-    @abc.abstractmethod
     def init_network(self, key: jax.Array) -> Params:
         """Fresh parameters of the network."""
+        return self.network.init(key, self.example_tokens())["params"]
 
     @abc.abstractmethod
     def start_from(self, agent: Params, representation: Representation) -> Params:
@@ -174,7 +174,7 @@ class Agent(abc.ABC):
             previous_action=jnp.zeros((1, 1, *none.shape[1:]), none.dtype), reward=jnp.zeros((1, 1)),
             terminated=zeros > 0, truncated=zeros > 0, segment=zeros + 1, position=zeros, states=state)
 
-    def pretrain(
+    def fit_belief(
         self, state: AgentState, tokens: Tokens, representation: Representation, key: jax.Array
     ) -> tuple[AgentState, Metrics]:
         """One step of the auxiliary losses alone: Believer's second stage, before learning the task."""
@@ -203,7 +203,7 @@ class Agent(abc.ABC):
         return AgentState(params, target, optimizer, state.updates + 1), metrics
 
     def labelled(self, tokens: Tokens, representation: Representation | None) -> Tokens:
-        """The tokens with z_s as the agent's network wants it: Believer's in units of its standard deviation."""
+        """The tokens with z_s as the agent's network wants it: Believer's standardised."""
         if not self.declaration.believes:
             return tokens
         scale = cast(Representation, representation)
@@ -213,7 +213,7 @@ class Agent(abc.ABC):
     def _exact(self) -> bool:
         """Whether gradient passes draw nothing, neither dropout nor Believer's latents, so that their outputs serve
         targets and bonus too."""
-        drops = self.config.network.dropout > 0 and memory_of(self.config) == "gpt"
+        drops = self.config.network.dropout > 0 and memory_of(self.config) not in ("gru", "mlp")
         return not drops and not self.declaration.believes
 
     def _apply(self, module: Any, params: Params, tokens: Tokens, key: jax.Array) -> Any:

@@ -56,10 +56,6 @@ class DQN(Agent):
         """On the random episodes of stage 1, where the agent has any."""
         return pretrain_updates(self.config)
 
-    def init_network(self, key: jax.Array) -> Params:
-        """Fresh parameters of the network."""
-        return self.network.init(key, self.example_tokens())["params"]
-
     def start_from(self, agent: Params, representation: Representation) -> Params:
         """Frozen phi and psi for the agent that sees the state; psi in the memoryless branch of the others."""
         if self.declaration.sees_state:

@@ -79,10 +79,6 @@ class SAC(Agent):
         fade = optax.linear_schedule(1.0, options.imitation_final, over)
         return jnp.asarray(fade(updates), jnp.float32)
 
-    def init_network(self, key: jax.Array) -> Params:
-        """Fresh parameters of the network."""
-        return self.network.init(key, self.example_tokens())["params"]
-
     def further_parameters(self) -> dict[str, Params]:
         """The temperature."""
         return {"log_temperature": jnp.log(jnp.float32(self.options.initial_temperature))}
@@ -306,7 +302,7 @@ def _network(env: Environment, config: Config, declaration: Variant) -> ActorCri
 
     return TwoBranchActorCritic(
         size, net, spec, norm, trunk, whole, actor=branch(), critic=None if declaration.critic == "state" else branch(),
-        critic_sees=declaration.critic, state_spec=state_spec, actor_moves_trunk=declaration.critic is not None)
+        critic_sees=declaration.critic, state_spec=state_spec, actor_moves_trunk=declaration.critic == "state")
 
 
 def _body_spec(spec: ArraySpec) -> ArraySpec:

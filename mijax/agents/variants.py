@@ -69,13 +69,16 @@ def needs_representation(config: Config) -> bool:
     return declaration.uses_representation or config.sac.looks_through_psi
 
 
-def unread_groups(config: Config, continuous: bool) -> set[str]:
-    """The groups of options that a configuration's agent never looks at, on SAC where actions are `continuous`."""
+def reads(config: Config, continuous: bool, option: str) -> bool:
+    """Whether a configuration's agent ever looks at an option such as `dqn.discount`, on SAC where actions are
+    `continuous`."""
     declaration = variant(config.agent)
-    read = {"dqn": not continuous, "sac": continuous, "information": declaration.uses_representation,
-            "zp": declaration.predicts_itself, "believer": declaration.believes, "mdp": declaration.sees_state,
-            "stage1": needs_representation(config)}
-    return {group for group, is_read in read.items() if not is_read}
+    by_group = {"dqn": not continuous, "sac": continuous, "information": declaration.informed,
+                "zp": declaration.predicts_itself, "believer": declaration.believes, "mdp": declaration.sees_state,
+                "stage1": needs_representation(config)}
+    if option == "information.start_from_psi":
+        return declaration.uses_representation and not declaration.sees_state
+    return by_group.get(option.split(".")[0], True)
 
 
 def memory_of(config: Config) -> MemoryKind:

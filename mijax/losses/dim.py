@@ -39,6 +39,8 @@ def dim_jensen_shannon(
     if weight is None:
         weight = jnp.full((size,), 1.0 / size, scores.dtype)
     chex.assert_shape(weight, (size,))
+    if identical is None and different is not None:
+        raise ValueError("different pairs need identical ones")
     if identical is None:
         positive_rows = jax.nn.softplus(-jnp.diagonal(scores))
         negative_rows = jax.nn.softplus(scores) @ weight

@@ -6,5 +6,4 @@ import jax.numpy as jnp
 
 def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
     """() mean of `x` where `mask`, both (...); 0 when nothing is valid."""
-    weight = mask.astype(x.dtype)
-    return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1)
+    return jnp.sum(jnp.where(mask, x, 0)) / jnp.maximum(jnp.sum(mask.astype(x.dtype)), 1)

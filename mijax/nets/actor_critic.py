@@ -27,7 +27,7 @@ LOG_SCALE_LOW, LOG_SCALE_HIGH = -5.0, 2.0
 CRITICS = 2
 
 
-def shown(frames: jax.Array, spec: ArraySpec) -> jax.Array:
+def without_blank(frames: jax.Array, spec: ArraySpec) -> jax.Array:
     """(N, *shape) frames without the channels that are always 0."""
     return frames[..., : spec.shape[-1] - spec.blank] if spec.blank else frames
 
@@ -77,7 +77,7 @@ class ActorCritic(nn.Module, abc.ABC):
 
     def look_at(self, frames: jax.Array) -> jax.Array:
         """(N, *observation_shape) -> what the branches see of them."""
-        return shown(frames, self.observation_spec)
+        return without_blank(frames, self.observation_spec)
 
     @abc.abstractmethod
     def encode(self, tokens: Tokens, deterministic: bool = True) -> Encoded:
@@ -118,7 +118,7 @@ class _WithTrunk(ActorCritic):
 
     def look_at(self, frames: jax.Array) -> jax.Array:
         """(N, *observation_shape) -> (N, D) the trunk's features, or the frames."""
-        seen = shown(frames, self.observation_spec)
+        seen = without_blank(frames, self.observation_spec)
         if self.trunk is None:
             return seen
         return self.trunk(seen) if self.whole else self.trunk.body(seen)

@@ -38,7 +38,7 @@ class BeliefBranches(nn.Module):
     """b beside psi(o), b a function of the mean over samples z_s ~ p(z_s | h) of a learned embedding of each.
 
     p(z_s | h) is a variational autoencoder: a summary x of the history (Table 2: 16 wide) and a standard normal latent
-    (Table 2: 16) decode to z_s, in units of its standard deviation. In gradient passes latents are drawn afresh.
+    (Table 2: 16) decode to z_s, standardised. In gradient passes latents are drawn afresh.
     """
 
     top: HistoryEncoder
@@ -65,7 +65,7 @@ class BeliefBranches(nn.Module):
         return encoder_for(self.observation_spec, self.features)
 
     def branches(self, tokens: Tokens, deterministic: bool = True) -> Belief:
-        """The belief and, where `tokens.z_s` is given in units of its standard deviation, the terms of the VAE."""
+        """The belief and, where `tokens.z_s` is given, standardised, the terms of the VAE."""
         x = self.summarise(self.top(tokens, deterministic))
         z_o = frame_features(self.bottom, tokens)
         samples = self.believer.samples

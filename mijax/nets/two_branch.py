@@ -55,7 +55,7 @@ class Outputs:
 
     q: jax.Array  # (R, L, A)  action values, by which the agent acts
     summary: jax.Array | None = None  # (R, L, W)  of the history
-    z_s: jax.Array | None = None  # (R, L, F)  predicted from the history, in units of its standard deviation
+    z_s: jax.Array | None = None  # (R, L, F)  predicted from the history, standardised (`Representation.standardise`)
     critic: jax.Array | None = None  # (R, L, A)  the asymmetric critic's values
     next_summary: jax.Array | None = None  # (R, L, W)  predicted summary after the action that was taken next
     belief: tuple[jax.Array, ...] | None = None  # decoded (R, L, F), mean and log-variance (R, L, Z), log scale ()
@@ -124,7 +124,7 @@ class Branches:
 
     both: jax.Array  # (N, W + F)  the memory branch beside the memoryless one
     summary: jax.Array  # (N, W)  of the history
-    z_s: jax.Array | None  # (N, F)  predicted from the history, in units of its standard deviation
+    z_s: jax.Array | None  # (N, F)  predicted from the history, standardised
     next_summary: jax.Array | None  # (N, W)  predicted summary after the action that was taken next
 
 
@@ -226,7 +226,7 @@ def own_encoder(spec: ArraySpec, dtype: jnp.dtype) -> ObservationEmbedder:
 
 @struct.dataclass
 class Prediction:
-    """A Gaussian over z_s at every token, in the units of its spread over the training set."""
+    """A Gaussian over z_s, standardised, at every token."""
 
     mean: jax.Array  # (R, L, F)
     log_variance: jax.Array | None = None  # (R, L) log of E|z_s - mean|^2, at most 0; None where it is not modelled

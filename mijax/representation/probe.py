@@ -16,6 +16,7 @@ import optax
 from envs_mjx.base import Environment, Variable
 from mijax.config import Stage1Config
 from mijax.losses.club import club_all_pairs
+from mijax.losses.information import LEAST_LOG_VARIANCE, log_likelihood_bonus
 from mijax.representation.dataset import Transitions, collect
 from mijax.representation.model import evaluate, networks_for
 from mijax.representation.train import History, encode_frames, seen_by_estimator, standardize
@@ -90,8 +91,7 @@ class ProbeReport:
     """`variance` Tr Var(z_s); `hidden_share` of it between values of the hidden variables; `cosine` mean and
     `cosine_max` largest cosine between the mean z_s of two hidden values."""
     bonus: dict[str, float]
-    """What an episode can earn with weight 1 by learning all, by form of the intrinsic reward; and
-    `explained_variance_least`, what it earns with the hidden value that pays least."""
+    """What an episode can earn on average, with weight 1 and by learning all, by form of the intrinsic reward."""
     p1_failures: tuple[str, ...]
     p2_failures: tuple[str, ...]
 
@@ -318,8 +318,7 @@ def _geometry(
     count = np.bincount(group)
     centers = np.stack([np.bincount(group, z_s[:, f]) for f in range(z_s.shape[1])], axis=1) / count[:, None]
     variance = float(np.sum(z_s.var(0)))
-    distance = np.sum((centers - z_s.mean(0)) ** 2, axis=1)
-    between = float((count / len(group)) @ distance)
+    between = float(np.sum((count / len(group)) @ (centers - z_s.mean(0)) ** 2))
     unit = centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-12)
     cosines = (unit @ unit.T)[np.triu_indices(len(unit), 1)]
     lengths = np.linalg.norm(z_s, axis=1) * np.linalg.norm(mean)
@@ -329,10 +328,15 @@ def _geometry(
                 "cosine": float(cosines.mean()) if len(cosines) else 1.0,
                 "cosine_max": float(cosines.max()) if len(cosines) else 1.0}
     # Before information f predicts the mean, after it z_s itself. Explained variance sums to 1 times what the hidden
-    # variables explain: the rest of z_s, if any, is seen without gathering information. A hidden value whose z_s is the
-    # mean of all earns nothing, which the mean over values does not show.
+    # variables explain: the rest of z_s, if any, is seen without gathering information.
+    told = jnp.asarray(centers, jnp.float32)
+    sure = jnp.full(len(told), LEAST_LOG_VARIANCE)
+    unsure = jnp.full(len(told), np.log(max(share, np.exp(LEAST_LOG_VARIANCE))))
+    gained = log_likelihood_bonus(
+        told, told, jnp.broadcast_to(jnp.asarray(z_s.mean(0), jnp.float32), told.shape), sure, unsure,
+        max(variance, 1e-12))
     return geometry, {"cosine": float(1 - prior_cosine), "explained_variance": share,
-                      "explained_variance_least": float(distance.min() / variance) if variance > 0 else 0.0}
+                      "log_likelihood": float((count / len(group)) @ np.asarray(gained))}
 
 
 def _verdicts(

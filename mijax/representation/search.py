@@ -22,6 +22,7 @@ from mijax.representation.dataset import Transitions, collect
 from mijax.representation.probe import ProbeReport, probe_on
 from mijax.representation.problem import Problem
 from mijax.representation.train import (
+    CONSTANT,
     History,
     LossWeights,
     TrainState,
@@ -143,7 +144,7 @@ def search(
     data_key, _, train_key = jax.random.split(first_key, 3)
     data = collect(env, data_key, config.episodes, config.data)
     problem = Problem.of(env, dataclasses.replace(config, **largest), data)
-    heldout_key, probe_key = jax.random.split(jax.random.fold_in(first_key, 1))
+    heldout_key, probe_key = jax.random.split(jax.random.fold_in(first_key, 3))
     heldout = collect(env, heldout_key, config.heldout_episodes, config.data, moved=config.copies > 0)
     init_keys = jnp.stack([jax.random.split(key, 3)[1] for key in keys.values()])
     group = _Group(
@@ -229,7 +230,7 @@ def _probe_all(
     for member in range(len(metrics["loss"])):
         state = jax.tree.map(lambda value, member=member: jnp.asarray(value[member]), states)
         representation, report = representation_of(problem, state), None
-        if np.isfinite(metrics["loss"][member]):
+        if np.isfinite(metrics["loss"][member]) and representation.z_s_variance >= CONSTANT:
             history = History(
                 metrics={}, dynamics=state.parameters["dynamics"], estimator=state.estimator.parameters,
                 estimator_view=problem.config.estimator_view, updates=0,

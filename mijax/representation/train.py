@@ -416,7 +416,7 @@ def train_on(
         updates=config.epochs * problem.updates_per_epoch,
         compile_seconds=compiled - started, seconds=time.perf_counter() - compiled)
     representation = representation_of(problem, state)
-    if representation.z_s_variance < CONSTANT:
+    if not representation.z_s_variance >= CONSTANT:  # nor NaN
         raise DivergenceError(f"stage 1: z_s is the same in every state, nothing to be informed about; "
                               f"try a smaller --stage1.phi-shrinkage than {config.phi_shrinkage}")
     return representation, history

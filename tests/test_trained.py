@@ -110,6 +110,8 @@ def test_options_that_are_not_read_are_named() -> None:
     options = train.parse([
         "--agent", "believer", "--information.intrinsic-weight", "3", "--information.no-start-from-psi"])
     assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--information.intrinsic-weight"]
+    options = train.parse(["--information.intrinsic-weight", "0", "--information.folds", "2"])
+    assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--information.folds"]
     options = train.parse(["--agent", "mdp", "--information.no-start-from-psi", "--stage1.epochs", "7"])
     assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--information.start-from-psi"]
     assert train.unread_options(train.parse(["--preset", "paper"]).config, registry.make("heaven_hell")) == []

@@ -78,6 +78,8 @@ def reads(config: Config, continuous: bool, option: str) -> bool:
                 "stage1": needs_representation(config)}
     if option == "information.start_from_psi":
         return declaration.uses_representation and not declaration.sees_state
+    if option in ("information.intrinsic_form", "information.folds"):
+        return declaration.informed and config.information.intrinsic_weight > 0
     return by_group.get(option.split(".")[0], True)
 
 

@@ -102,9 +102,10 @@ def test_believer_and_ours_do_not_share_features(tmp_path: pathlib.Path, capsys:
 
 
 def test_options_that_are_not_read_are_named() -> None:
-    options = train.parse(["--agent", "base", "--dqn.discount", "0.9", "--sac.discount", "0.5", "--zp.weight", "3"])
+    options = train.parse(["--agent", "base", "--dqn.discount", "0.9", "--sac.discount", "0.5", "--zp.weight", "3",
+                           "--dqn.pretrain-updates", "7"])
     unread = train.unread_options(options.config, registry.make("heaven_hell"))
-    assert unread == ["--sac.discount", "--zp.weight"]
+    assert unread == ["--dqn.pretrain-updates", "--sac.discount", "--zp.weight"]
     options = train.parse(["--agent", "believer", "--stage1.lambda-club", "3", "--stage1.lambda-r", "3"])
     assert train.unread_options(options.config, registry.make("heaven_hell")) == ["--stage1.lambda-club"]
     options = train.parse([

@@ -72,15 +72,17 @@ def needs_representation(config: Config) -> bool:
 def reads(config: Config, continuous: bool, option: str) -> bool:
     """Whether a configuration's agent ever looks at an option such as `dqn.discount`, on SAC where actions are
     `continuous`."""
-    declaration = variant(config.agent)
-    by_group = {"dqn": not continuous, "sac": continuous, "information": declaration.informed,
-                "zp": declaration.predicts_itself, "believer": declaration.believes, "mdp": declaration.sees_state,
-                "stage1": needs_representation(config)}
-    if option == "information.start_from_psi":
-        return declaration.uses_representation and not declaration.sees_state
-    if option in ("information.intrinsic_form", "information.folds"):
-        return declaration.informed and config.information.intrinsic_weight > 0
-    return by_group.get(option.split(".")[0], True)
+    declaration, begins = variant(config.agent), not continuous and _has_random_episodes(config)
+    read = {
+        "dqn": not continuous, "dqn.pretrain_updates": begins,
+        "dqn.pretrained_epsilon": begins and config.dqn.pretrain_updates > 0, "sac": continuous,
+        "information": declaration.informed,
+        "information.intrinsic_form": declaration.informed and config.information.intrinsic_weight > 0,
+        "information.folds": declaration.informed and config.information.intrinsic_weight > 0,
+        "information.start_from_psi": declaration.uses_representation and not declaration.sees_state,
+        "zp": declaration.predicts_itself, "believer": declaration.believes, "mdp": declaration.sees_state,
+        "stage1": needs_representation(config)}
+    return read.get(option, read.get(option.split(".")[0], True))
 
 
 def memory_of(config: Config) -> MemoryKind:
@@ -102,9 +104,12 @@ def title_of(config: Config, continuous: bool = False) -> str:
 
 def pretrain_updates(config: Config) -> int:
     """Updates with which Double DQN begins on the random episodes of stage 1; 0 for an agent that has none."""
+    return config.dqn.pretrain_updates if _has_random_episodes(config) else 0
+
+
+def _has_random_episodes(config: Config) -> bool:
     declaration = variant(config.agent)
-    has_episodes = declaration.uses_representation and not declaration.sees_state and config.stage1.data == "random"
-    return config.dqn.pretrain_updates if has_episodes else 0
+    return declaration.uses_representation and not declaration.sees_state and config.stage1.data == "random"
 
 
 def stage1_of(config: Config) -> Stage1Config:

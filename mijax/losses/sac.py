@@ -83,7 +83,7 @@ def scale_loss(action: jax.Array, log_scale: jax.Array, demonstrated: jax.Array,
 
     Args:
         action: (..., A) tanh of the mean.
-        log_scale: (..., A) log sigma, before squashing.
+        log_scale: (..., A) log sigma, before squashing; where |a| is near 1 the noise of actions is smaller than it.
         demonstrated: (..., A) a*.
         mask: (...) bool, the transitions of demonstrations.
 

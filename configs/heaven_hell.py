@@ -2,8 +2,8 @@
 
     python -m mijax.train --domain heaven_hell
 
-Solved in 5 seeds of 5, first after 1 000 to 3 000 steps, and optimal in every evaluation from 12 000 on
-(results/heaven_hell_mi). Five to six minutes a seed on one core.
+Solved in 5 seeds of 5, first after 1 000 to 3 000 steps, and optimal in every evaluation from 10 000 on
+(results/heaven_hell_mi). Five to seven minutes a seed on one core.
 """
 
 from mijax.config import Config, DQNConfig, Stage1Config

@@ -55,8 +55,8 @@ function drawCurves() {
   }
   if (best !== null) {
     const under = plot.y(best) < plot.top + 16;
-    add(plot.svg, "text", {class: "optimum", x: plot.left + 8, y: plot.y(best) + (under ? 15 : -5)},
-        `optimum ${readable(best)}`);
+    const place = {x: plot.right - 8, y: plot.y(best) + (under ? 15 : -5), "text-anchor": "end"};
+    add(plot.svg, "text", {class: "optimum", ...place}, `optimum ${readable(best)}`);
   }
   plot.marks = add(plot.svg, "g");
   curves.last = last;

@@ -36,10 +36,10 @@ def folder_of(run: RunFolder, seed: int) -> pathlib.Path:
 
 
 def reuse(
-    source: RunFolder, env: Environment, features: int, seeds: tuple[int, ...]
+    source: RunFolder, env: Environment, features: int, seeds: tuple[int, ...], say: Callable[[str], None]
 ) -> Callable[[RunFolder], None]:
-    """Read representations of another run, the same seed's where it has one, else its first; the result puts them, and
-    what their probes found, into a run.
+    """Read representations of another run, the same seed's where it has one, else its first, which is said; the result
+    puts them, and what their probes found, into a run.
 
     Raises:
         RunError: the other run has no representation of so many features.
@@ -50,6 +50,9 @@ def reuse(
         raise RunError(f"{source.path}: holds no representation (no seed_K/{FOLDER})")
     origins = {seed: folder_of(source, seed if seed in found else found[0]) for seed in seeds}
     read = {seed: load_representation(origin, env) for seed, origin in origins.items()}
+    lacking = ", ".join(str(seed) for seed in seeds if seed not in found)
+    if lacking:
+        say(f"{source.path}: has no stage 1 of seed {lacking}; that of its seed {found[0]} takes its place")
     widths = {representation.z_s_mean.shape[0] for representation in read.values()} - {features}
     if widths:
         raise RunError(f"{source.path}: holds features {widths.pop()} wide, wanted --stage1.features {features}")

@@ -207,7 +207,7 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
         require(needs_representation(config), "representation", options.representation,
                 f"none: --agent {config.agent} looks through no features here")
         source = RunFolder.open(options.representation)
-        fill = stage1.reuse(source, env, config.stage1.features, every_seed)
+        fill = stage1.reuse(source, env, config.stage1.features, every_seed, say)
         _require_kind(source, stage1_of(config), pretrain_updates(config) > 0)
     unread = unread_options(config, env)
     if unread:

@@ -82,10 +82,13 @@ def test_features_are_taken_over_by_the_environment_they_are_of(domain: str, tmp
     env = registry.make(domain)
     source = with_representation(RunFolder.create(tmp_path / "source", {"domain": domain}), env)
     features = Config().stage1.features
-    run = RunFolder.create(tmp_path / "run", {"domain": domain}, stage1.reuse(source, env, features, (4,)))
+    said: list[str] = []
+    taken_over = stage1.reuse(source, env, features, (0, 4), said.append)
+    run = RunFolder.create(tmp_path / "run", {"domain": domain}, taken_over)
+    assert said == [f"{source.path}: has no stage 1 of seed 4; that of its seed 0 takes its place"]
     assert (stage1.folder_of(run, 4) / "representation.json").exists()
     with pytest.raises(RepresentationError, match=f"its domain is {env.name}, this run's is sphinx"):
-        stage1.reuse(source, registry.make("sphinx"), features, (4,))
+        stage1.reuse(source, registry.make("sphinx"), features, (4,), said.append)
 
 
 def test_believer_and_ours_do_not_share_features(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:

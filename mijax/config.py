@@ -327,9 +327,10 @@ class InformationConfig:
     """Weight of the memory branch's prediction of z_s, in fractions of the variance of z_s."""
     intrinsic_weight: float = 0.5
     """alpha: weight of the information bonus in the total reward."""
-    intrinsic_form: IntrinsicForm = "log_likelihood"
-    """How the bonus measures the information gained about z_s in one step: by the ratio of Eq. 4, by the share of the
-    variance of z_s that is explained, or by the paper's cosines."""
+    intrinsic_form: IntrinsicForm = "explained_variance"
+    """How the bonus measures the information gained about z_s in one step: by the share of the variance of z_s that is
+    explained, by the paper's cosines, or by the ratio of Eq. 4, which also pays where the hidden value was expected,
+    but wants a z_s that holds nothing else: it pays for small leaks of what is seen."""
     folds: int = 1
     """Models f: 1, or 2 that are each trained on half of the episodes and pay the bonus on the other half."""
     start_from_psi: bool = True

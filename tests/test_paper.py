@@ -72,7 +72,7 @@ def test_only_what_an_agent_reads_must_be_the_same(tmp_path: pathlib.Path) -> No
 
 def command(out: pathlib.Path) -> list[str]:
     """The options that all runs here share."""
-    return ["--domain", "heaven_hell", "--steps", "400", "--out", str(out), *OPTIONS]
+    return ["--domain", "heaven_hell", "--steps", "600", "--out", str(out), *OPTIONS]
 
 
 @pytest.fixture(scope="module")
@@ -92,13 +92,13 @@ def contents(out: pathlib.Path) -> dict[pathlib.Path, tuple[int, int]]:
 @pytest.mark.slow
 def test_an_experiment_leaves_its_figure_and_table(done: pathlib.Path) -> None:
     text = (done / "fig5.md").read_text()
-    assert "1 seed, 400 steps (paper: 5 seeds, 500,000 steps)" in text
+    assert "1 seed, 600 steps (paper: 5 seeds, 500,000 steps)" in text
     assert "P(Ours better), area" in text
-    assert "--steps 400" in text
+    assert "--steps 600" in text
     with Image.open(done / "fig5.png") as image:
         assert min(image.size) > 300
     places = {path.parent.parent.name for path in done.glob("runs/heaven_hell/*/*/summary.json")}
-    assert places == {"mi-400", "mi-gru-400"}
+    assert places == {"mi-600", "mi-gru-600"}
     features = [path for path in (done / "runs" / "heaven_hell").rglob("representation.msgpack")
                 if "seed_0" in path.parts]
     assert len(features) == 3  # the shared ones, and a copy in each run
@@ -113,7 +113,7 @@ def test_what_is_there_is_not_made_again_and_seeds_are_added(done: pathlib.Path)
     assert paper.main(["fig32", "--seeds", "2", *command(done)]) == 0
     after = contents(done)
     assert before.items() <= after.items()
-    assert RunFolder.open(done / "runs/heaven_hell/mi-400/seeds_1").seeds() == (1,)
+    assert RunFolder.open(done / "runs/heaven_hell/mi-600/seeds_1").seeds() == (1,)
     assert {path.name for path in done.glob("fig32*")} >= {"fig32.png", "fig32.md", "fig32_heaven_hell.png"}
     assert "| heaven_hell | 1 " in (done / "fig32.md").read_text()
 
@@ -128,7 +128,7 @@ def test_an_arm_can_be_left_out(done: pathlib.Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on(done: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = RunFolder.open(done / "runs/heaven_hell/mi-gru-400/seeds_0")
+    run = RunFolder.open(done / "runs/heaven_hell/mi-gru-600/seeds_0")
     summary = run.summary()
     (run.path / "summary.json").unlink()
     before = comparable(run.path, 0)

@@ -14,6 +14,7 @@ from envs_mjx.base import ArraySpec
 from mijax.agents.dqn import DQN, make_dqn
 from mijax.config import Config, MemoryName, NetworkConfig, Stage1Config
 from mijax.frames import FrameTable
+from mijax.losses.information import LEAST_LOG_VARIANCE
 from mijax.nets.dropout import Dropout
 from mijax.nets.gpt import sine_positions
 from mijax.packing import Layout, first_fit, gather_rows, one_per_row
@@ -195,13 +196,19 @@ def test_padding_changes_neither_results_nor_gradients(case: Case):
 
 
 def test_information_model_packs(case: Case):
-    model = case.agent.information_model
-    assert model is not None
+    assert case.agent.information_model is not None
+    model = case.agent.information_model.clone(has_variance=True)
     layout, tokens = packed()
     params = some_parameters(model, tokens)
     apply = jax.jit(lambda tokens: model.apply({"params": params}, tokens))
-    got, expected = of_episodes(apply(tokens), layout), of_episodes(apply(case.tokens), case.layout)
+    one, other = apply(tokens), apply(case.tokens)
+    got, expected = of_episodes(one.mean, layout), of_episodes(other.mean, case.layout)
     assert got.shape == (sum(LENGTHS), FEATURES)
+    np.testing.assert_allclose(got, expected, atol=1e-5)
+    got, expected = of_episodes(one.log_variance, layout), of_episodes(other.log_variance, case.layout)
+    assert got.shape == (sum(LENGTHS),)
+    assert np.ptp(got) > 1e-4
+    assert LEAST_LOG_VARIANCE <= got.min() <= got.max() <= 0
     np.testing.assert_allclose(got, expected, atol=1e-5)
 
 

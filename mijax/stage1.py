@@ -15,7 +15,7 @@ from mijax.files import write_atomically
 from mijax.progress import ProgressDisplay
 from mijax.representation import DivergenceError, learn_representation
 from mijax.representation.probe import ProbeReport, format_report, probe
-from mijax.representation.search import SearchResult, draw_candidates, search
+from mijax.representation.search import CONFIRMATIONS, SearchResult, Weights, confirm, draw_candidates, search
 from mijax.representation.storage import FACTS_FILE, load_representation, save_representation
 from mijax.run_folder import RunError, RunFolder
 from mijax.types import Representation
@@ -92,6 +92,9 @@ def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say
     _keep(folder, env, representation, report, timing)
     jax.clear_caches()  # stage 1's programs are 0.2 GiB on CarFlag-2D
     runtime.release_memory()
+    if history.starts > 1:
+        say(f"stage 1, seed {seed}: z_s was erased, and stage 1 was begun again from other weights, start "
+            f"{history.starts}")
     say(f"stage 1, seed {seed}: {history.updates} updates in {history.compile_seconds + history.seconds:.0f} s "
         f"({history.updates_per_second:.0f}/s), kept in {folder}\n{format_report(report)}")
     return report
@@ -122,10 +125,14 @@ def choose_weights(
     run: RunFolder, env: Environment, config: Stage1Config, seeds: tuple[int, ...], count: int,
     say: Callable[[str], None]
 ) -> SearchResult:
-    """Search `count` loss weightings, keep the best one's representations, the table and the figure of all."""
+    """Search `count` loss weightings, try the best with further seeds, keep one's representations, the table and the
+    figure of all."""
     keys = {seed: representation_key(seed) for seed in seeds}
+    further = {seed: representation_key(seed) for seed in range(max(seeds) + 1, max(seeds) + 1 + CONFIRMATIONS)}
     with ProgressDisplay(f"{count} weightings, {len(seeds)} seeds", config.epochs, unit="epochs") as progress:
         result = search(env, config, draw_candidates(config, count), keys, on_progress=progress.update)
+    result = confirm(env, config, result, further, lambda weights, seed, passes: say(
+        f"{_flags(weights)}\n{'passes' if passes else 'fails'} with seed {seed}"))
     for seed, representation in result.best.representations.items():
         report = result.best.reports[seed]
         if report is None:
@@ -136,10 +143,16 @@ def choose_weights(
     write_atomically(run.path / SEARCH_FILE, json.dumps(result.as_dict(), indent=2).encode())
     figures.draw_trade_off(result, run.path / TRADE_OFF_FILE, f"{figures.display_name(env.name)}: {count} weightings, "
                            f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}, {config.epochs} epochs")
-    flags = " ".join(f"--stage1.{name.replace('_', '-')} {value:g}" for name, value in result.best.weights.items())
-    say(f"{count} weightings in {result.seconds:.0f} s; the best: {flags}\nAll of them: {run.path / SEARCH_FILE}, "
-        f"{run.path / TRADE_OFF_FILE}")
+    verdict = "None passes P1 and P2"
+    if any(candidate.confirmed for candidate in result.candidates):
+        verdict = f"It passes with {sum(result.best.confirmed)} of {len(further)} further seeds"
+    say(f"{count} weightings in {result.seconds:.0f} s; the best: {_flags(result.best.weights)}\n{verdict}\n"
+        f"All of them: {run.path / SEARCH_FILE}, {run.path / TRADE_OFF_FILE}")
     return result
+
+
+def _flags(weights: Weights) -> str:
+    return " ".join(f"--stage1.{name.replace('_', '-')} {value:g}" for name, value in weights.items())
 
 
 def _keep(

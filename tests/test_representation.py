@@ -17,6 +17,7 @@ from mijax import represent
 from mijax.config import ConfigError, Stage1Config
 from mijax.nets.encoders import Convolution, encoder_for, image_plan
 from mijax.representation import DivergenceError, encode_observation, encode_state, learn_representation
+from mijax.representation import train as training
 from mijax.representation.dataset import Transitions, collect, tabulate
 from mijax.representation.model import evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
@@ -338,6 +339,35 @@ def test_features_that_vanish_are_one_line_that_names_the_option(env):
         learn_representation(env, dataclasses.replace(SMALL, phi_shrinkage=1e4), jax.random.key(0))
 
 
+def test_features_that_vanish_are_learnt_again_from_other_weights_and_the_same_data(env, learnt, monkeypatch):
+    tried = []
+
+    def data_of(key):
+        return tuple(np.asarray(jax.random.key_data(key)))
+
+    def train_on(problem, init_key, train_key, on_progress):
+        del on_progress
+        tried.append((problem, data_of(init_key), data_of(train_key)))
+        if len(tried) < 3:
+            raise training.ErasedError("stage 1: z_s is the same in every state")
+        return learnt
+
+    monkeypatch.setattr(training, "train_on", train_on)
+    representation, history = learn_representation(env, SMALL, jax.random.key(1))
+    assert representation is learnt[0]
+    assert history.starts == 3
+    assert learnt[1].starts == 1
+    problems, *keys = zip(*tried, strict=True)
+    assert all(problem is problems[0] for problem in problems)
+    assert len({*keys[0], *keys[1]}) == 6
+    data_key, init_key, train_key = jax.random.split(jax.random.key(1), 3)
+    assert (keys[0][0], keys[1][0]) == (data_of(init_key), data_of(train_key))
+    assert tuple(np.asarray(problems[0].data.key)) == data_of(data_key)
+    tried.clear()
+    with pytest.raises(training.ErasedError):
+        learn_representation(env, SMALL, jax.random.key(1), starts=2)
+
+
 @pytest.mark.lenient
 def test_too_little_data_is_an_error(env):
     with pytest.raises(ConfigError, match=r"at most the \d+ transitions"):
@@ -390,6 +420,7 @@ def test_probe_sees_a_leak_of_any_size_beyond_round_off(env, learnt, leak, clean
     assert report.p2 is clean, report.p2_failures
     assert any("x leaks into z_s" in reason for reason in report.p2_failures) is not clean
     assert ("P2 pass" in format_report(report)) is clean
+    assert 0.1 * leak - 1e-7 < report.geometry["rest"] < 0.5 * leak + 1e-7  # x is in [0, 1], the side -1 or 1
 
 
 @pytest.mark.lenient

@@ -12,9 +12,19 @@ from PIL import Image
 from envs_mjx import registry
 from mijax import represent
 from mijax.config import Stage1Config
-from mijax.representation import learn_representation
+from mijax.representation import DivergenceError, learn_representation
+from mijax.representation import search as searching
 from mijax.representation.probe import Decoding, ProbeReport
-from mijax.representation.search import RANGES, Candidate, draw_candidates, map_members, quality, search
+from mijax.representation.search import (
+    RANGES,
+    Candidate,
+    SearchResult,
+    confirm,
+    draw_candidates,
+    map_members,
+    quality,
+    search,
+)
 from mijax.representation.storage import load_representation
 from mijax.types import Representation
 
@@ -103,6 +113,39 @@ def test_fainter_leaks_rank_higher_and_the_worst_seed_counts():
     assert Candidate({}, {0: _report(1.0, 1.0, passes=True), 1: None}, 1, none).quality == 0.0
 
 
+def test_the_best_that_passes_with_all_further_seeds_comes_first(env, monkeypatch):
+    passing = {1.0: 2, 2.0: 0, 3.0: 3, 4.0: 3}  # by lambda_r: with so many seeds
+
+    def learn(env, config, key, starts):
+        del env
+        assert starts == 1  # a weighting that needs a second start is not robust
+        if config.lambda_r == 2.0:
+            raise DivergenceError("stage 1: z_s is the same in every state")
+        return config, key
+
+    def probe(representation, env, config, key, history):
+        del env, representation, key
+        return _report(1.0, 1.0, passes=int(history) < passing[config.lambda_r])
+
+    monkeypatch.setattr(searching, "learn_representation", learn)
+    monkeypatch.setattr(searching, "probe", probe)
+    monkeypatch.setattr(jax.random, "fold_in", lambda key, data: key)
+    representation: dict[int, Representation] = {0: None}  # pyright: ignore
+    candidates = [
+        Candidate({"lambda_r": number}, {0: _report(1.0, 1.0, passes=number != 0.5)}, 3, representation)
+        for number in (0.5, 1.0, 2.0, 3.0, 4.0)]
+    candidates.append(Candidate({"lambda_r": 5.0}, {0: _report(1.0, 1.0, passes=True)}, 1, {}))
+    verdicts = []
+    result = confirm(env, SMALL, SearchResult(tuple(candidates), 10.0), {7: 0, 8: 1, 9: 2},  # pyright: ignore
+                     lambda weights, seed, passes: verdicts.append((weights["lambda_r"], seed, passes)))
+    assert verdicts == [(1.0, 7, True), (1.0, 8, True), (1.0, 9, False), (2.0, 7, False),
+                        (3.0, 7, True), (3.0, 8, True), (3.0, 9, True)]
+    assert [candidate.weights["lambda_r"] for candidate in result.candidates] == [3.0, 1.0, 0.5, 2.0, 4.0, 5.0]
+    assert result.best.confirmed == (True, True, True)
+    assert result.as_dict()["candidates"][1]["confirmed"] == [True, True, False]
+    assert result.seconds >= 10.0
+
+
 def test_the_command_keeps_the_best_and_draws_them_all(tmp_path: pathlib.Path, capsys, env):
     options = ["--domain", "heaven_hell", "--out", str(tmp_path / "run"), "--seeds", "3,", "--search", "5",
                "--stage1.epochs", "3", "--stage1.episodes", "20", "--stage1.heldout-episodes", "10",
@@ -110,6 +153,7 @@ def test_the_command_keeps_the_best_and_draws_them_all(tmp_path: pathlib.Path, c
     assert represent.main(options) == 0
     said = capsys.readouterr().out
     assert "5 weightings in" in said
+    assert "None passes" in said  # after three epochs
     assert "--stage1.lambda-club" in said
     assert "of 1 representations pass" in said
     found = json.loads((tmp_path / "run" / "search.json").read_text())["candidates"]

@@ -88,8 +88,9 @@ class ProbeReport:
     errors: dict[str, float]
     """Held out: `reward_r2`, and next-feature errors and CLUB (nats); empty without the networks of training."""
     geometry: dict[str, float]
-    """`variance` Tr Var(z_s); `hidden_share` of it between values of the hidden variables; `cosine` mean and
-    `cosine_max` largest cosine between the mean z_s of two hidden values."""
+    """`variance` Tr Var(z_s); `hidden_share` of it between values of the hidden variables; `rest`, how far z_s varies
+    while they stay, as a fraction of its standard deviation: the size of a leak; `cosine` mean and `cosine_max` largest
+    cosine between the mean z_s of two hidden values."""
     bonus: dict[str, float]
     """What an episode can earn on average, with weight 1 and by learning all, by form of the intrinsic reward."""
     p1_failures: tuple[str, ...]
@@ -324,7 +325,7 @@ def _geometry(
     lengths = np.linalg.norm(z_s, axis=1) * np.linalg.norm(mean)
     prior_cosine = np.mean(z_s @ mean / np.maximum(lengths, 1e-12))
     share = between / variance if variance > 0 else 0.0
-    geometry = {"variance": variance, "hidden_share": share,
+    geometry = {"variance": variance, "hidden_share": share, "rest": float(np.sqrt(max(1 - share, 0.0))),
                 "cosine": float(cosines.mean()) if len(cosines) else 1.0,
                 "cosine_max": float(cosines.max()) if len(cosines) else 1.0}
     # Before information f predicts the mean, after it z_s itself. Explained variance sums to 1 times what the hidden

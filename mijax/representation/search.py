@@ -19,14 +19,16 @@ from jax.sharding import AxisType, PartitionSpec
 from envs_mjx.base import Environment
 from mijax.config import Stage1Config
 from mijax.representation.dataset import Transitions, collect
-from mijax.representation.probe import ProbeReport, probe_on
+from mijax.representation.probe import ProbeReport, probe, probe_on
 from mijax.representation.problem import Problem
 from mijax.representation.train import (
     CONSTANT,
+    DivergenceError,
     History,
     LossWeights,
     TrainState,
     initial_state,
+    learn_representation,
     make_epoch,
     representation_of,
 )
@@ -45,9 +47,14 @@ CLEAN = 1e-14
 """A fraction of the variance of z_s that is as good as none. Far below what the probe sees, since a margin is what
 makes weights hold for other seeds: on Heaven-Hell those that left 5e-15 passed with 5 of 5 seeds afterwards, those that
 left 2e-9, as good by the probe, with 3 of 5."""
+CONFIRMATIONS = 3
+"""Further seeds that weights have to pass with: on Heaven-Hell the best of 16, which had passed with the search's one
+seed, passed with 3 of 5 afterwards."""
 Weights = dict[str, float]
 """Values of `Stage1Config` fields, by name."""
 ProgressCallback = Callable[[int, dict[str, float]], None]
+VerdictCallback = Callable[[Weights, int, bool], None]
+"""Called with weights, a seed, and whether the weights pass with it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +67,9 @@ class Candidate:
     """How long it was trained: a candidate that was given up has fewer epochs, and linear probes alone."""
     representations: dict[int, Representation]
     """Empty when it was given up."""
+    confirmed: tuple[bool, ...] = ()
+    """Whether it passes with further seeds, one after the other up to the first failure; empty when it was not tried.
+    """
 
     @property
     def passed(self) -> int:
@@ -88,7 +98,7 @@ class SearchResult:
         """For search.json."""
         return {"seconds": self.seconds, "candidates": [
             {"weights": candidate.weights, "epochs": candidate.epochs, "passed": candidate.passed,
-             "quality": candidate.quality,
+             "quality": candidate.quality, "confirmed": list(candidate.confirmed),
              "probes": {str(seed): None if report is None else report.as_dict()
                         for seed, report in candidate.reports.items()}}
             for candidate in self.candidates]}
@@ -171,6 +181,53 @@ def search(
         group = group.keep(best[: math.ceil(len(configs) * KEPT)], len(keys))
     ranked = sorted(results.values(), key=lambda c: (c.epochs, c.passed, c.quality), reverse=True)
     return SearchResult(tuple(ranked), time.perf_counter() - started)
+
+
+def confirm(
+    env: Environment, config: Stage1Config, result: SearchResult, keys: dict[int, jax.Array],
+    on_verdict: VerdictCallback
+) -> SearchResult:
+    """Try the candidates that passed with further seeds, the best first, until one passes with all of them.
+
+    What passes with one seed may do so by luck. Each further seed is an ordinary stage 1, data and all, and a candidate
+    is left at its first failure.
+
+    Args:
+        env: the environment.
+        config: all but the weights.
+        result: of `search`.
+        keys: by further seed, the key that its stage 1 follows from.
+        on_verdict: called after each training.
+
+    Returns:
+        The candidates, those that pass with more further seeds first, and otherwise as they were.
+    """
+    started = time.perf_counter()
+    candidates = list(result.candidates)
+    for place, candidate in enumerate(candidates):
+        if candidate.representations and candidate.passed == len(candidate.reports):
+            verdicts = []
+            for seed, key in keys.items():
+                verdicts.append(_passes(env, dataclasses.replace(config, **candidate.weights), key))
+                on_verdict(candidate.weights, seed, verdicts[-1])
+                if not verdicts[-1]:
+                    break
+            candidates[place] = dataclasses.replace(candidate, confirmed=tuple(verdicts))
+            if all(verdicts):
+                break
+    ranked = sorted(candidates, key=lambda candidate: sum(candidate.confirmed), reverse=True)
+    return SearchResult(tuple(ranked), result.seconds + time.perf_counter() - started)
+
+
+def _passes(env: Environment, config: Stage1Config, key: jax.Array) -> bool:
+    """Whether stage 1 from `key` passes P1 and P2."""
+    try:
+        representation, history = learn_representation(env, config, key, starts=1)
+    except DivergenceError:
+        return False
+    report = probe(representation, env, config, jax.random.fold_in(key, 3), history)
+    jax.clear_caches()  # as in `mijax.stage1.learn`
+    return report.p1 and report.p2
 
 
 @dataclasses.dataclass

@@ -26,7 +26,7 @@ from mijax.losses.dim import dim_jensen_shannon
 from mijax.losses.dynamics import next_feature_loss, reward_loss
 from mijax.losses.variables import variables_loss
 from mijax.nets.encoders import Encoder
-from mijax.representation.dataset import Transitions, collect
+from mijax.representation.dataset import collect
 from mijax.representation.model import evaluate, init_parameters, local_features
 from mijax.representation.problem import Batch, Problem
 from mijax.types import Metrics, Params, Representation
@@ -43,9 +43,16 @@ ProgressCallback = Callable[[int, dict[str, float]], None]
 
 
 class DivergenceError(UserError):
-    """A loss became infinite or not a number; the message names it."""
+    """A loss became infinite or not a number, which the message names, or z_s a constant."""
 
 
+class ErasedError(DivergenceError):
+    """phi's shrinkage has left nothing of z_s."""
+
+
+STARTS = 3
+"""First weights that are tried in turn while z_s ends up erased, which happened with the preset of Heaven-Hell in one
+of 19 seeds."""
 MANY_VALUES = 2**24
 """In frames that are encoded at once."""
 CLUB_START = 0.01
@@ -123,6 +130,8 @@ class History:
     """Time until the first epoch was done."""
     seconds: float
     """Time of all the other epochs."""
+    starts: int = 1
+    """First weights that were tried: all but the last ended with z_s erased."""
 
     @property
     def updates_per_second(self) -> float:
@@ -377,26 +386,37 @@ def make_epoch(problem: Problem) -> Epoch:
 
 
 def learn_representation(
-    env: Environment, config: Stage1Config, key: jax.Array, on_progress: ProgressCallback | None = None
+    env: Environment, config: Stage1Config, key: jax.Array, on_progress: ProgressCallback | None = None,
+    starts: int = STARTS
 ) -> tuple[Representation, History]:
     """Stage 1 from end to end: collect transitions, train, keep the encoders and the scale of z_s.
 
-    Everything follows from `key`, so that a seed does not depend on its neighbours.
+    Everything follows from `key`, so that a seed does not depend on its neighbours. Where training erases z_s it begins
+    again on the same transitions, from other first weights.
 
     Raises:
-        DivergenceError: a loss is no finite number.
+        DivergenceError: a loss is no finite number, or z_s was erased from each of `starts` first weights.
         ConfigError: the data set is smaller than one batch.
     """
     data_key, init_key, train_key = jax.random.split(key, 3)
-    return train_on(collect(env, data_key, config.episodes, config.data), env, config, init_key, train_key, on_progress)
+    problem = Problem.of(env, config, collect(env, data_key, config.episodes, config.data))
+    start = 1
+    while True:
+        try:
+            representation, history = train_on(problem, init_key, train_key, on_progress)
+            return representation, dataclasses.replace(history, starts=start)
+        except ErasedError:
+            if start == starts:
+                raise
+        init_key, train_key = jax.random.fold_in(init_key, start), jax.random.fold_in(train_key, start)
+        start += 1
 
 
 def train_on(
-    data: Transitions, env: Environment, config: Stage1Config, init_key: jax.Array, train_key: jax.Array,
-    on_progress: ProgressCallback | None = None
+    problem: Problem, init_key: jax.Array, train_key: jax.Array, on_progress: ProgressCallback | None = None
 ) -> tuple[Representation, History]:
-    """Stage 1 on transitions that were collected elsewhere (demonstrations); see `learn_representation`."""
-    problem = Problem.of(env, config, data)
+    """Stage 1 on transitions, from one set of first weights; see `learn_representation`."""
+    config = problem.config
     state = initial_state(problem, init_key)
     # Weights are compiled in: as arguments they would round differently, and every known result would move a little.
     epoch = jax.jit(functools.partial(make_epoch(problem), LossWeights.of(config)))
@@ -417,8 +437,9 @@ def train_on(
         compile_seconds=compiled - started, seconds=time.perf_counter() - compiled)
     representation = representation_of(problem, state)
     if not representation.z_s_variance >= CONSTANT:  # nor NaN
-        raise DivergenceError(f"stage 1: z_s is the same in every state, nothing to be informed about; "
-                              f"try a smaller --stage1.phi-shrinkage than {config.phi_shrinkage}")
+        raise ErasedError(f"stage 1: z_s is the same in every state, nothing to be informed about; "
+                          f"try a smaller --stage1.phi-shrinkage than {config.phi_shrinkage}, or, where rewards are "
+                          f"rare, --stage1.rewarded {max(100, 2 * config.rewarded)}")
     return representation, history
 
 

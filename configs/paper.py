@@ -45,7 +45,7 @@ def paper(config: Config, vector_observation: bool) -> Config:
         replay_steps=100_000)
     information = dataclasses.replace(
         config.information, auxiliary_weight=0.5, intrinsic_weight=INTRINSIC_WEIGHT.get(domain, 10.0),
-        intrinsic_form="cosine")
+        intrinsic_form="cosine", intrinsic_telescopes=False)
     stage1 = dataclasses.replace(
         config.stage1, epochs=EPOCHS, rewarded=0, club_ramp=0.0, warmup=0.0, phi_shrinkage=0.0,
         lower_bound="jensen_shannon", state_bound="jensen_shannon", estimator_view="features",

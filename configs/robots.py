@@ -47,6 +47,7 @@ def robot(domain: str, copies: int, epochs: int, lambda_club: float = 0.3, steps
         zp=SelfPredictionConfig(weight=0.1),
         # The paper's weight of 0.1 paid up to 0.35 for an episode of moving about, as z_s holds what moves too: one
         # solved agent, one seed, went back from 1.0 to 0.44 within 10 000 steps.
-        information=InformationConfig(auxiliary_weight=0.5, intrinsic_weight=0.02, intrinsic_form="cosine"),
+        information=InformationConfig(auxiliary_weight=0.5, intrinsic_weight=0.02, intrinsic_form="cosine",
+                                      intrinsic_telescopes=False),
         evaluation=EvaluationConfig(every=500, episodes=20),
     )

@@ -331,6 +331,10 @@ class InformationConfig:
     """How the bonus measures the information gained about z_s in one step: by the share of the variance of z_s that is
     explained, by the paper's cosines, or by the ratio of Eq. 4, which also pays where the hidden value was expected,
     but wants a z_s that holds nothing else: it pays for small leaks of what is seen."""
+    intrinsic_telescopes: bool = True
+    """Whether the guess before a step is compared with z_s before it, so that the bonus of an episode adds up to what
+    is known at its end. Otherwise with z_s after it (paper): the same for a z_s that stays, while one that also holds
+    what is seen pays for going to and fro."""
     folds: int = 1
     """Models f: 1, or 2 that are each trained on half of the episodes and pay the bonus on the other half."""
     start_from_psi: bool = True

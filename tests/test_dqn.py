@@ -76,9 +76,11 @@ def test_td_loss_by_hand(
     assert float(metrics["train/bonus"]) == 0
 
 
-@pytest.mark.parametrize("form", ["explained_variance", "cosine", "log_likelihood"])
-def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: Any):
-    config = dataclasses.replace(CONFIG, information=dataclasses.replace(CONFIG.information, intrinsic_form=form))
+@pytest.mark.parametrize(("form", "telescopes"), [
+    ("explained_variance", False), ("cosine", False), ("cosine", True), ("log_likelihood", True)])
+def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: Any, telescopes: bool):
+    config = dataclasses.replace(CONFIG, information=dataclasses.replace(
+        CONFIG.information, intrinsic_form=form, intrinsic_telescopes=telescopes))
     state = AgentCase(make_dqn, DISCRETE, config).state if form == "log_likelihood" else states["mi"]
     agent, tokens, rep = agent_of(config), episodes(DISCRETE), representation(SHAPES)
     assert agent.information_model is not None
@@ -101,18 +103,19 @@ def test_losses_and_bonus_of_ours_by_hand(states: dict[str, AgentState], form: A
         for t in range(first, end):
             errors_f.append(np.sum((z[row, t] - f[row][row, t]) ** 2) / 2.0)
             unseen = f[1 - row][row]  # the bonus comes from the model that is not trained on this episode
+            z_t, z_before = z[row, t], z[row, t - 1 if telescopes else t]
             errors_k.append(np.sum((z[row, t] - k[row, t]) ** 2) / 2.0)
             if form == "log_likelihood":
                 errors_variance.append(-nats(z[row, t], f[row][row, t], float(believed[row].log_variance[row, t])))
             if t > first and form == "cosine":
-                bonus[row, t] = 0.5 * (cosine(z[row, t], unseen[t]) - cosine(z[row, t], unseen[t - 1]))
+                bonus[row, t] = 0.5 * (cosine(z_t, unseen[t]) - cosine(z_before, unseen[t - 1]))
             elif t > first and form == "log_likelihood":
                 before, after = (
-                    max(nats(z[row, t], unseen[i], float(believed[1 - row].log_variance[row, i])) / math.log(10), -1)
-                    for i in (t - 1, t))
+                    max(nats(x, unseen[i], float(believed[1 - row].log_variance[row, i])) / math.log(10), -1)
+                    for i, x in ((t - 1, z_before), (t, z_t)))
                 bonus[row, t] = 0.5 * (after - before)
             elif t > first:
-                before, after = (np.sum((z[row, t] - unseen[i]) ** 2) for i in (t - 1, t))
+                before, after = (np.sum((x - unseen[i]) ** 2) for i, x in ((t - 1, z_before), (t, z_t)))
                 bonus[row, t] = 0.5 * (before - after) / 2.0
     expected, _ = loss_by_loops(q, q_target, bonus, config.dqn)
     loss, metrics = jax.jit(agent.loss)(state.params, state.target, tokens, rep, state.updates, jax.random.key(0))

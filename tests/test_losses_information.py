@@ -93,6 +93,26 @@ def test_bonuses_sum_over_an_episode_to_what_was_learned_when_z_is_constant():
     assert float(total) == pytest.approx(float(info.cosine(z[0], f[-1]) - info.cosine(z[0], f[0])), rel=1e-4)
 
 
+def test_bonuses_that_telescope_sum_to_what_was_learned_whatever_z_does():
+    """To and fro between two values that f always knows: nothing is gained, and the paper's form pays every step."""
+    pair = random_features(20, 2, 4)
+    z, f = jnp.tile(pair, (4, 1)), jnp.tile(pair, (4, 1))
+    sure = jnp.full(7, info.LEAST_LOG_VARIANCE)
+    forms = {
+        "cosine": lambda before: info.cosine_bonus(z[1:], f[1:], f[:-1], before),
+        "explained": lambda before: info.explained_variance_bonus(z[1:], f[1:], f[:-1], 3.0, before),
+        "likelihood": lambda before: info.log_likelihood_bonus(z[1:], f[1:], f[:-1], sure, sure, 3.0, before)}
+    for name, bonus in forms.items():
+        np.testing.assert_allclose(bonus(z[:-1]), 0, atol=1e-6, err_msg=name)
+        assert float(bonus(None).min()) > 0.1, name
+    z, f = random_features(21, 9, 4), random_features(22, 9, 4)
+    total = info.explained_variance_bonus(z[1:], f[1:], f[:-1], 3.0, z[:-1]).sum()
+    before, after = (float(((z[t] - f[t]) ** 2).sum()) for t in (0, -1))
+    assert float(total) == pytest.approx((before - after) / 3.0, rel=1e-4)
+    total = info.cosine_bonus(z[1:], f[1:], f[:-1], z[:-1]).sum()
+    assert float(total) == pytest.approx(float(info.cosine(z[-1], f[-1]) - info.cosine(z[0], f[0])), rel=1e-4, abs=1e-5)
+
+
 def test_finding_out_a_binary_variable_earns_one():
     """z_s takes two values equally often; f starts at the mean and ends at the truth: all of the variance."""
     values = random_features(14, 2, 6)

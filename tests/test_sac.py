@@ -216,7 +216,7 @@ def test_losses_and_bonus_of_ours_by_hand():
     bonus = np.zeros((2, ROW))
     for row, first, end in SPANS:
         for t in range(first + 1, end):
-            bonus[row, t] = 0.5 * (error(f[row, t - 1], z[row, t]) - error(f[row, t], z[row, t]))
+            bonus[row, t] = 0.5 * (error(f[row, t - 1], z[row, t - 1]) - error(f[row, t], z[row, t]))
     heads = case.says(case.params, case.tokens, taken_actions(case))[3]
     expected = losses_by_loops(case, bonus) | {
         "loss/f": error(f, z)[real].mean(),

@@ -255,15 +255,17 @@ class Agent(abc.ABC):
 
     def bonus(self, f: Prediction, z_s: jax.Array, representation: Representation) -> jax.Array:
         """(R, L) information gained about z_s (R, L, F) on arriving at each token; of a first token meaningless."""
-        form, variance = self.config.information.intrinsic_form, representation.z_s_variance
+        options, variance = self.config.information, representation.z_s_variance
         f_t = representation.destandardise(f.mean)
         f_tm1 = jnp.roll(f_t, 1, axis=1)
-        if form == "cosine":
-            return info.cosine_bonus(z_s, f_t, f_tm1)
-        if form == "explained_variance":
-            return info.explained_variance_bonus(z_s, f_t, f_tm1, variance)
+        z_s_tm1 = jnp.roll(z_s, 1, axis=1) if options.intrinsic_telescopes else None
+        if options.intrinsic_form == "cosine":
+            return info.cosine_bonus(z_s, f_t, f_tm1, z_s_tm1)
+        if options.intrinsic_form == "explained_variance":
+            return info.explained_variance_bonus(z_s, f_t, f_tm1, variance, z_s_tm1)
         log_variance = cast(jax.Array, f.log_variance)
-        return info.log_likelihood_bonus(z_s, f_t, f_tm1, log_variance, jnp.roll(log_variance, 1, axis=1), variance)
+        return info.log_likelihood_bonus(
+            z_s, f_t, f_tm1, log_variance, jnp.roll(log_variance, 1, axis=1), variance, z_s_tm1)
 
     def _auxiliary(
         self, online: Sequence[Heads], averaged: Sequence[Heads], tokens: Tokens, representation: Representation | None

@@ -73,12 +73,12 @@ def reads(config: Config, continuous: bool, option: str) -> bool:
     """Whether a configuration's agent ever looks at an option such as `dqn.discount`, on SAC where actions are
     `continuous`."""
     declaration, begins = variant(config.agent), not continuous and _has_random_episodes(config)
+    pays = declaration.informed and config.information.intrinsic_weight > 0
     read = {
         "dqn": not continuous, "dqn.pretrain_updates": begins,
         "dqn.pretrained_epsilon": begins and config.dqn.pretrain_updates > 0, "sac": continuous,
         "information": declaration.informed,
-        "information.intrinsic_form": declaration.informed and config.information.intrinsic_weight > 0,
-        "information.folds": declaration.informed and config.information.intrinsic_weight > 0,
+        "information.intrinsic_form": pays, "information.intrinsic_telescopes": pays, "information.folds": pays,
         "information.start_from_psi": declaration.uses_representation and not declaration.sees_state,
         "zp": declaration.predicts_itself, "believer": declaration.believes, "mdp": declaration.sees_state,
         "stage1": needs_representation(config)}

@@ -60,23 +60,30 @@ def cosine(x: jax.Array, y: jax.Array) -> jax.Array:
     return jnp.sum(x * y, axis=-1) / norms
 
 
-def cosine_bonus(z_s_t: jax.Array, f_t: jax.Array, f_tm1: jax.Array) -> jax.Array:
+def cosine_bonus(
+    z_s_t: jax.Array, f_t: jax.Array, f_tm1: jax.Array, z_s_tm1: jax.Array | None = None
+) -> jax.Array:
     """The paper's intrinsic reward: cos(z_t, f(h_t)) - cos(z_t, f(h_{t-1})), both against the same z_t.
+
+    That pays for every change of z_s which the next observation tells: where z_s holds some of what is seen, for going
+    to and fro. With z_{t-1} in the second term, here and in the other two forms, the sum over an episode telescopes to
+    what is known at its end, and no more can be earned than by knowing all.
 
     Args:
         z_s_t: (..., F) phi(s_t).
         f_t: (..., F) f(h_t).
         f_tm1: (..., F) f(h_{t-1}).
+        z_s_tm1: (..., F) phi(s_{t-1}), to telescope; None: z_t in both terms.
 
     Returns:
         (...) bonus in [-2, 2]; its sum over an episode depends on the geometry of z_s.
     """
     chex.assert_equal_shape([z_s_t, f_t, f_tm1])
-    return cosine(z_s_t, f_t) - cosine(z_s_t, f_tm1)
+    return cosine(z_s_t, f_t) - cosine(z_s_t if z_s_tm1 is None else z_s_tm1, f_tm1)
 
 
 def explained_variance_bonus(
-    z_s_t: jax.Array, f_t: jax.Array, f_tm1: jax.Array, variance: jax.Array | float
+    z_s_t: jax.Array, f_t: jax.Array, f_tm1: jax.Array, variance: jax.Array | float, z_s_tm1: jax.Array | None = None
 ) -> jax.Array:
     """Eq. 4 with a Gaussian, normalised: (|z_t - f(h_{t-1})|^2 - |z_t - f(h_t)|^2) / Tr Var(z_s).
 
@@ -85,12 +92,14 @@ def explained_variance_bonus(
         f_t: (..., F) f(h_t).
         f_tm1: (..., F) f(h_{t-1}).
         variance: () Tr Var(z_s).
+        z_s_tm1: (..., F) phi(s_{t-1}), to telescope; None: z_t in both terms. See `cosine_bonus`.
 
     Returns:
-        (...) bonus; for a z_s constant in an episode it sums to the fraction of z_s that the history explains.
+        (...) bonus; if it telescopes, or z_s is constant in an episode, it sums to the fraction of z_s that the history
+        explains in the end and did not in the beginning.
     """
     chex.assert_equal_shape([z_s_t, f_t, f_tm1])
-    before = jnp.sum(jnp.square(z_s_t - f_tm1), axis=-1)
+    before = jnp.sum(jnp.square((z_s_t if z_s_tm1 is None else z_s_tm1) - f_tm1), axis=-1)
     after = jnp.sum(jnp.square(z_s_t - f_t), axis=-1)
     return (before - after) / variance
 
@@ -116,7 +125,7 @@ def variance_nll(
 
 def log_likelihood_bonus(
     z_s_t: jax.Array, f_t: jax.Array, f_tm1: jax.Array, log_variance_t: jax.Array, log_variance_tm1: jax.Array,
-    variance: jax.Array | float,
+    variance: jax.Array | float, z_s_tm1: jax.Array | None = None,
 ) -> jax.Array:
     """The third term of Eq. 4, log f(z_t | h_t) - log f(z_t | h_{t-1}), of a Gaussian that knows how sure it is.
 
@@ -131,13 +140,15 @@ def log_likelihood_bonus(
         log_variance_t: (...) log of E|z_t - f_t|^2, in fractions of `variance`, at least `LEAST_LOG_VARIANCE`.
         log_variance_tm1: (...) the same of h_{t-1}.
         variance: () Tr Var(z_s).
+        z_s_tm1: (..., F) phi(s_{t-1}), to telescope; None: z_t in both terms. See `cosine_bonus`.
 
     Returns:
-        (...) bonus; for a z_s constant in an episode it sums to the information gained between the first and last step.
+        (...) bonus; if it telescopes, or z_s is constant in an episode, it sums to the information gained between the
+        first and last step.
     """
     chex.assert_equal_shape([z_s_t, f_t, f_tm1])
     later = _log_likelihood(f_t, log_variance_t, z_s_t, variance)
-    earlier = _log_likelihood(f_tm1, log_variance_tm1, z_s_t, variance)
+    earlier = _log_likelihood(f_tm1, log_variance_tm1, z_s_t if z_s_tm1 is None else z_s_tm1, variance)
     unit = -LEAST_LOG_VARIANCE / 2
     return jnp.maximum(later / unit, -1.0) - jnp.maximum(earlier / unit, -1.0)
 

@@ -52,7 +52,7 @@ class ErasedError(DivergenceError):
 
 STARTS = 3
 """First weights that are tried in turn while z_s ends up erased, which happened with the preset of Heaven-Hell in one
-of 19 seeds."""
+of 21 seeds."""
 MANY_VALUES = 2**24
 """In frames that are encoded at once."""
 CLUB_START = 0.01

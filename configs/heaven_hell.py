@@ -6,7 +6,7 @@ Solved in 5 seeds of 5, first after 1 000 to 3 000 steps, and optimal in every e
 (results/heaven_hell_mi). Five to seven minutes a seed on one core.
 """
 
-from mijax.config import Config, DQNConfig, InformationConfig, Stage1Config
+from mijax.config import Config, DQNConfig, Stage1Config
 
 CONFIG = Config(
     domain="heaven_hell",
@@ -14,5 +14,4 @@ CONFIG = Config(
     stage1=Stage1Config(episodes=150, epochs=500, learning_rate=3e-3, lambda_r=10.0, lambda_s=1.0,
                         lambda_o=0.5, lambda_club=1.0, lambda_dim_s=0.0, lambda_dim_o=1.0),
     dqn=DQNConfig(pretrain_updates=800),
-    information=InformationConfig(intrinsic_form="log_likelihood"),
 )

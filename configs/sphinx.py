@@ -15,5 +15,5 @@ CONFIG = Config(
                         lambda_club=0.3, lambda_dim_s=0.0, lambda_dim_o=0.5),
     network=NetworkConfig(action_embedding=16, observation_embedding=48),
     dqn=DQNConfig(warmup_episodes=300, pretrain_updates=500, pretrained_epsilon=0.7, epsilon_steps=60_000),
-    information=InformationConfig(intrinsic_weight=1.0, intrinsic_form="log_likelihood"),
+    information=InformationConfig(intrinsic_weight=1.0),
 )

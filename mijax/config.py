@@ -327,10 +327,10 @@ class InformationConfig:
     """Weight of the memory branch's prediction of z_s, in fractions of the variance of z_s."""
     intrinsic_weight: float = 0.5
     """alpha: weight of the information bonus in the total reward."""
-    intrinsic_form: IntrinsicForm = "explained_variance"
-    """How the bonus measures the information gained about z_s in one step: by the share of the variance of z_s that is
-    explained, by the paper's cosines, or by the ratio of Eq. 4, which also pays where the hidden value was expected,
-    but wants a z_s that holds nothing else: it pays for small leaks of what is seen."""
+    intrinsic_form: IntrinsicForm = "log_likelihood"
+    """How the bonus measures the information gained about z_s in one step: by the ratio of Eq. 4, which pays for
+    becoming sure; by the share of the variance of z_s that is explained, which pays nothing where the hidden value is
+    the one that was expected; or by the paper's cosines."""
     intrinsic_telescopes: bool = True
     """Whether the guess before a step is compared with z_s before it, so that the bonus of an episode adds up to what
     is known at its end. Otherwise with z_s after it (paper): the same for a z_s that stays, while one that also holds

@@ -408,7 +408,7 @@ def learn_representation(
         except ErasedError:
             if start == starts:
                 raise
-        init_key, train_key = jax.random.fold_in(init_key, start), jax.random.fold_in(train_key, start)
+        init_key, train_key = jax.random.split(jax.random.fold_in(key, 3 + start))  # 0 to 3 are taken
         start += 1
 
 

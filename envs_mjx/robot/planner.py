@@ -23,6 +23,8 @@ _MOVED = 0.003
 _BATCH = 16
 """Episodes side by side: the fastest on a CPU."""
 _RETREAT_STEPS = 2
+_ROUNDS = 8
+"""Rounds of episodes, at most, until there are enough demonstrations: for experts that fail nine times in ten."""
 
 
 @struct.dataclass
@@ -148,19 +150,37 @@ class Planner:
 
 
 def demonstrations(env: RobotTask, key: jax.Array, number: int = 80, spare: float = 0.25) -> Trajectory:
-    """`number` demonstrations, successful ones first: those of a few more episodes that succeed, in their order.
+    """`number` demonstrations, successful ones first: those of enough episodes to have as many, in their order.
+
+    An expert that seldom fails has them of one round of episodes. One that presses down with a shaking hand, where that
+    is a protective stop, takes a second, and after `_ROUNDS` the rest are failures.
 
     Args:
-        spare: how many more episodes are played at least, as a fraction of `number`.
+        spare: how many more episodes a round plays at least, as a fraction of `number`.
 
     Returns:
         Trajectories with a leading axis `number`. Check `success`: it is False where too few succeeded.
     """
     played = -(-(number + int(number * spare)) // _BATCH) * _BATCH  # whole batches: a partial one is compiled by itself
-    keys = jax.random.split(key, played)
-    episodes = jax.lax.map(Planner(env, noise=env.expert_noise).play, keys, batch_size=_BATCH)
-    order = jnp.argsort(~episodes.success, stable=True)[:number]
-    return jax.tree.map(lambda x: x[order], episodes)
+    planner = Planner(env, noise=env.expert_noise)
+
+    def round_of(key: jax.Array) -> Trajectory:
+        return jax.lax.map(planner.play, jax.random.split(key, played), batch_size=_BATCH)
+
+    def again(carry: tuple[jax.Array, Trajectory]) -> tuple[jax.Array, Trajectory]:
+        rounds, kept = carry
+        more = round_of(jnp.where(rounds == 0, key, jax.random.fold_in(key, rounds)))
+        episodes = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), kept, more)
+        last = jnp.where(episodes.outcome == RUNNING, 2, 1)  # what was not played, after failures
+        order = jnp.argsort(jnp.where(episodes.success, 0, last), stable=True)[:number]
+        return rounds + 1, jax.tree.map(lambda x: x[order], episodes)
+
+    def too_few(carry: tuple[jax.Array, Trajectory]) -> jax.Array:
+        rounds, kept = carry
+        return (rounds < _ROUNDS) & ~kept.success.all()
+
+    none = jax.tree.map(lambda x: jnp.zeros((number, *x.shape[1:]), x.dtype), jax.eval_shape(round_of, key))
+    return jax.lax.while_loop(too_few, again, (jnp.zeros((), jnp.int32), none))[1]
 
 
 def _wrap_half_turn(angle: jax.Array) -> jax.Array:

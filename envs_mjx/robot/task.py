@@ -226,7 +226,7 @@ class RobotTask(Environment):
         return jnp.stack([seen, jnp.zeros_like(seen)], axis=-1), jnp.stack([seen, masked], axis=-1)
 
     def demonstrations(self, key: jax.Array, number: int) -> Demonstrations:
-        """`number` episodes of the scripted expert (Appendix C.1), the successful ones of a few more first."""
+        """`number` episodes of the scripted expert (Appendix C.1), the successful ones of as many as it takes first."""
         from envs_mjx.robot import planner  # it builds on this module
 
         episodes = planner.demonstrations(self, key, number)

@@ -77,13 +77,14 @@ def memories(domain: str) -> dict[str, tuple[Arm, ...]]:
 
 
 def informed(domain: str) -> Arm:
-    """Ours with its intrinsic reward, also where the preset goes without: episodes then earn up to its weight more."""
+    """Ours with its intrinsic reward, also where the preset goes without: episodes then earn up to twice its weight
+    more, from sure and wrong to sure and right."""
     preset = configs.preset(domain)
     if preset.information.intrinsic_weight > 0:
         return MI
     options = ("--agent", "mi", "--information.intrinsic-weight", f"{BONUS_WEIGHT:g}")
     if preset.dqn.value_bound > 0:  # of what an episode can earn, bonus included
-        options += ("--dqn.value-bound", f"{preset.dqn.value_bound + BONUS_WEIGHT:g}")
+        options += ("--dqn.value-bound", f"{preset.dqn.value_bound + 2 * BONUS_WEIGHT:g}")
     return Arm("mi-bonus", f"Ours, bonus {BONUS_WEIGHT:g}", AGENT_COLOURS["mi"], options, "ours")
 
 

@@ -86,7 +86,7 @@ def learn(run: RunFolder, env: Environment, config: Stage1Config, seed: int, say
     with ProgressDisplay(f"stage 1, seed {seed}", config.epochs, unit="epochs") as progress:
         representation, history = learn_representation(env, config, key, on_progress=progress.update)
     report = probe(representation, env, config, jax.random.fold_in(key, 3), history)
-    timing = {"updates": history.updates, "updates_per_second": history.updates_per_second,
+    timing = {"starts": history.starts, "updates": history.updates, "updates_per_second": history.updates_per_second,
               "compile_seconds": history.compile_seconds, "seconds": history.seconds,
               "wall_seconds": time.perf_counter() - started}
     _keep(folder, env, representation, report, timing)
@@ -131,24 +131,43 @@ def choose_weights(
     further = {seed: representation_key(seed) for seed in range(max(seeds) + 1, max(seeds) + 1 + CONFIRMATIONS)}
     with ProgressDisplay(f"{count} weightings, {len(seeds)} seeds", config.epochs, unit="epochs") as progress:
         result = search(env, config, draw_candidates(config, count), keys, on_progress=progress.update)
-    result = confirm(env, config, result, further, lambda weights, seed, passes: say(
-        f"{_flags(weights)}\n{'passes' if passes else 'fails'} with seed {seed}"))
-    for seed, representation in result.best.representations.items():
-        report = result.best.reports[seed]
+    for seed, report in result.best.reports.items():
         if report is None:
             raise DivergenceError(f"stage 1: every weighting that was kept diverged with seed {seed}; try a smaller "
                                   f"--stage1.learning-rate than {config.learning_rate}")
-        _keep(folder_of(run, seed), env, representation, report, {"weights": result.best.weights})
-        say(f"seed {seed}, kept in {folder_of(run, seed)}\n{format_report(report)}")
-    write_atomically(run.path / SEARCH_FILE, json.dumps(result.as_dict(), indent=2).encode())
-    figures.draw_trade_off(result, run.path / TRADE_OFF_FILE, f"{figures.display_name(env.name)}: {count} weightings, "
-                           f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}, {config.epochs} epochs")
-    verdict = "None passes P1 and P2"
-    if any(candidate.confirmed for candidate in result.candidates):
-        verdict = f"It passes with {sum(result.best.confirmed)} of {len(further)} further seeds"
-    say(f"{count} weightings in {result.seconds:.0f} s; the best: {_flags(result.best.weights)}\n{verdict}\n"
+    _keep_search(run, env, config, result)  # the trainings that follow may be stopped
+    result = confirm(env, config, result, further, lambda weights, seed, passes: say(
+        f"{_flags(weights)}\n{'passes' if passes else 'fails'} with seed {seed}"))
+    _keep_search(run, env, config, result)
+    for seed, report in result.best.reports.items():
+        if report is not None:
+            say(f"seed {seed}, kept in {folder_of(run, seed)}\n{format_report(report)}")
+    say(f"{count} weightings in {result.seconds:.0f} s; the best: {_flags(result.best.weights)}\n"
+        f"{_verdict(result, len(further))}\n"
         f"All of them: {run.path / SEARCH_FILE}, {run.path / TRADE_OFF_FILE}")
     return result
+
+
+def _keep_search(run: RunFolder, env: Environment, config: Stage1Config, result: SearchResult) -> None:
+    """The best candidate's representations, the table and the figure of all."""
+    best, count = result.best, len(result.candidates)
+    for seed, report in best.reports.items():
+        assert report is not None
+        _keep(folder_of(run, seed), env, best.representations[seed], report, {"weights": best.weights})
+    write_atomically(run.path / SEARCH_FILE, json.dumps(result.as_dict(), indent=2).encode())
+    seeds = f"{len(best.reports)} seed{'s' if len(best.reports) > 1 else ''}"
+    figures.draw_trade_off(result, run.path / TRADE_OFF_FILE,
+                           f"{figures.display_name(env.name)}: {count} weightings, {seeds}, {config.epochs} epochs")
+
+
+def _verdict(result: SearchResult, further: int) -> str:
+    """Of the candidate that is kept, tried with `further` seeds up to the first failure."""
+    confirmed = result.best.confirmed
+    if not any(candidate.confirmed for candidate in result.candidates):
+        return "None passes P1 and P2"
+    if all(confirmed) and len(confirmed) == further:
+        return f"It passes with all of {further} further seeds"
+    return f"It passes with {sum(confirmed)} further seeds and fails with the next, of {further} at most"
 
 
 def _flags(weights: Weights) -> str:

@@ -45,6 +45,7 @@ def training_of(run: RunFolder) -> Training:
     if stored["agent"] not in VARIANTS:
         raise RunError(f"{run.path}: its agent {stored['agent']!r} is another program's, accepted: mijax.train's runs")
     seeds, track = stored.pop("seed_list", ()), stored.pop("track", "none")
+    stored.setdefault("information", {}).setdefault("intrinsic_telescopes", False)  # as runs were before they could
     return Training(config_from_dict(stored), tuple(seeds), cast(TrackerName, track))
 
 

@@ -33,6 +33,7 @@ from mijax.representation.train import (
     encoder_loss,
     initial_state,
     optimizers,
+    representation_of,
     shrink,
     standardize_directions,
 )
@@ -366,6 +367,18 @@ def test_features_that_vanish_are_learnt_again_from_other_weights_and_the_same_d
     tried.clear()
     with pytest.raises(training.ErasedError):
         learn_representation(env, SMALL, jax.random.key(1), starts=2)
+
+
+@pytest.mark.lenient
+def test_a_variance_that_is_not_finite_is_divergence(env, monkeypatch):
+    def diverged(problem, state):
+        return dataclasses.replace(representation_of(problem, state), z_s_variance=jnp.nan)
+
+    monkeypatch.setattr(training, "representation_of", diverged)
+    with pytest.raises(DivergenceError, match=r"variance of z_s is nan after epoch 1; try a smaller --stage1\.learning"
+                       ) as error:
+        learn_representation(env, dataclasses.replace(SMALL, epochs=1), jax.random.key(0))
+    assert not isinstance(error.value, training.ErasedError)
 
 
 @pytest.mark.lenient

@@ -369,7 +369,7 @@ def test_an_expert_that_fails_half_the_time_plays_on(monkeypatch: pytest.MonkeyP
     shown = jax.jit(lambda key: demonstrations(env, key, 32))(key)
     assert shown.success.all()
     play = jax.jit(lambda key: jax.lax.map(Planner(env, noise=env.expert_noise).play, jax.random.split(key, 48)))
-    rounds = [play(k) for k in (key, jax.random.fold_in(key, 1))]
+    rounds = [play(k) for k in (key, jax.random.fold_in(key, 48 + 1))]
     poses = np.concatenate([np.asarray(r.states.poses)[np.asarray(r.success)] for r in rounds])
     np.testing.assert_array_equal(shown.states.poses, poses[:32])
 

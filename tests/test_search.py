@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from envs_mjx import registry
-from mijax import represent
+from mijax import represent, stage1
 from mijax.config import Stage1Config
 from mijax.representation import DivergenceError, learn_representation
 from mijax.representation import search as searching
@@ -146,7 +146,13 @@ def test_the_best_that_passes_with_all_further_seeds_comes_first(env, monkeypatc
     assert result.seconds >= 10.0
 
 
-def test_the_command_keeps_the_best_and_draws_them_all(tmp_path: pathlib.Path, capsys, env):
+def test_the_command_keeps_the_best_and_draws_them_all(tmp_path: pathlib.Path, capsys, monkeypatch, env):
+    def confirm_later(*arguments):
+        left = {path.name for path in (tmp_path / "run").rglob("*.*")}
+        assert {"search.json", "trade_off.png", "probe.json", "representation.json"} <= left  # should it be stopped
+        return confirm(*arguments)
+
+    monkeypatch.setattr(stage1, "confirm", confirm_later)
     options = ["--domain", "heaven_hell", "--out", str(tmp_path / "run"), "--seeds", "3,", "--search", "5",
                "--stage1.epochs", "3", "--stage1.episodes", "20", "--stage1.heldout-episodes", "10",
                "--stage1.batch-size", "200"]

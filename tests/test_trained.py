@@ -68,6 +68,13 @@ def test_options_seeds_and_tracker_come_back(tmp_path: pathlib.Path) -> None:
             seeds_of(run, text)
 
 
+def test_runs_from_before_bonuses_could_telescope(tmp_path: pathlib.Path) -> None:
+    stored = Training(Config(), (0,)).as_dict()
+    del stored["information"]["intrinsic_telescopes"]
+    assert Config().information.intrinsic_telescopes
+    assert not training_of(RunFolder.create(tmp_path / "run", stored)).config.information.intrinsic_telescopes
+
+
 @pytest.mark.parametrize(("stored", "message"), [
     ({}, "holds representations but no agent"), ({"agent": "ppo"}, "its agent 'ppo' is another program's")])
 def test_runs_of_others(stored: dict[str, Any], message: str, tmp_path: pathlib.Path) -> None:

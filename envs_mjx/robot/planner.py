@@ -23,8 +23,8 @@ _MOVED = 0.003
 _BATCH = 16
 """Episodes side by side: the fastest on a CPU."""
 _RETREAT_STEPS = 2
-_ROUNDS = 8
-"""Rounds of episodes, at most, until there are enough demonstrations: for experts that fail nine times in ten."""
+_ROUNDS = 10
+"""Rounds of episodes, at most, until there are enough demonstrations: for experts that fail up to nine times in ten."""
 
 
 @struct.dataclass
@@ -169,7 +169,7 @@ def demonstrations(env: RobotTask, key: jax.Array, number: int = 80, spare: floa
 
     def again(carry: tuple[jax.Array, Trajectory]) -> tuple[jax.Array, Trajectory]:
         rounds, kept = carry
-        more = round_of(jnp.where(rounds == 0, key, jax.random.fold_in(key, rounds)))
+        more = round_of(jnp.where(rounds == 0, key, jax.random.fold_in(key, played + rounds)))  # no episode's key
         episodes = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), kept, more)
         last = jnp.where(episodes.outcome == RUNNING, 2, 1)  # what was not played, after failures
         order = jnp.argsort(jnp.where(episodes.success, 0, last), stable=True)[:number]

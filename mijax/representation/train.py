@@ -436,7 +436,10 @@ def train_on(
         updates=config.epochs * problem.updates_per_epoch,
         compile_seconds=compiled - started, seconds=time.perf_counter() - compiled)
     representation = representation_of(problem, state)
-    if not representation.z_s_variance >= CONSTANT:  # nor NaN
+    variance = float(representation.z_s_variance)
+    if not np.isfinite(variance):
+        raise DivergenceError(_diverged("the variance of z_s", variance, config.epochs, config))
+    if variance < CONSTANT:
         raise ErasedError(f"stage 1: z_s is the same in every state, nothing to be informed about; "
                           f"try a smaller --stage1.phi-shrinkage than {config.phi_shrinkage}, or, where rewards are "
                           f"rare, --stage1.rewarded {max(100, 2 * config.rewarded)}")
@@ -446,8 +449,12 @@ def train_on(
 def _refuse_divergence(metrics: dict[str, float], epoch: int, config: Stage1Config) -> None:
     bad = [name for name, value in metrics.items() if not np.isfinite(value) and name != "loss"]
     if bad:
-        raise DivergenceError(f"stage 1: {bad[0]} is {metrics[bad[0]]} after epoch {epoch}; "
-                              f"try a smaller --stage1.learning-rate than {config.learning_rate}")
+        raise DivergenceError(_diverged(bad[0], metrics[bad[0]], epoch, config))
+
+
+def _diverged(what: str, value: float, epoch: int, config: Stage1Config) -> str:
+    return (f"stage 1: {what} is {value} after epoch {epoch}; "
+            f"try a smaller --stage1.learning-rate than {config.learning_rate}")
 
 
 def representation_of(problem: Problem, state: TrainState) -> Representation:

@@ -231,7 +231,9 @@ HEADS = {"value_heads_0", "value_heads_1"}
     ("mi", {"loss/actor": {"actor", "policy_head"}, "loss/td": {"trunk", "critic", *HEADS}, "loss/f": {"f"},
             "loss/auxiliary": {"trunk", "actor", "critic"}}),
     ("ua", {"loss/actor": {"actor", "policy_head"}, "loss/td": {"trunk", "critic", "state_encoder", *HEADS}}),
-    ("ba", {"loss/actor": {"trunk", "actor", "policy_head"}, "loss/td": {"state_encoder", *HEADS}})])
+    ("ba", {"loss/actor": {"trunk", "actor", "policy_head"}, "loss/td": {"state_encoder", *HEADS}}),
+    ("believer", {"loss/actor": {"actor", "policy_head"}, "loss/td": {"trunk", "history", *HEADS},
+                  "loss/belief": {"trunk", "history"}})])
 def test_who_learns_from_what(name: str, expected: dict[str, set[str]]):
     """The actor's loss moves the actor alone, and the trunk where the critics do not look through it; the critics' the
     trunk too; f learns from its own loss only."""

@@ -178,7 +178,7 @@ def _network(env: Environment, config: Config, declaration: Variant) -> TwoBranc
         return PrivilegedQ(env.state_spec, spec, features, config.mdp.sees, num_actions, config.network)
     history = HistoryEncoder(num_actions, env.horizon + 1, memory_of(config), config.network)
     if declaration.believes:
-        return BeliefQ(history, spec, features, config.believer)
+        return BeliefQ(config.network, spec, features, top=history, believer=config.believer)
     return TwoBranchQ(
         history, spec, features, bottom_psi=declaration.uses_representation, predicts_state=declaration.informed,
         predicts_itself=declaration.predicts_itself, critic=declaration.critic, state_spec=env.state_spec)

@@ -29,7 +29,7 @@ from mijax.nets.actor_critic import (
     PrivilegedActorCritic,
     TwoBranchActorCritic,
 )
-from mijax.nets.belief import BeliefBranches
+from mijax.nets.belief import BeliefBranches, BeliefReader
 from mijax.nets.encoders import encoder_for
 from mijax.nets.privileged import PrivilegedFeatures
 from mijax.nets.two_branch import HistoryEncoder, MemoryState, TwoBranch
@@ -291,8 +291,10 @@ def _network(env: Environment, config: Config, declaration: Variant) -> ActorCri
     state_spec = _body_spec(env.state_spec) if config.sac.looks_through_psi else env.state_spec
     history = HistoryEncoder(size, env.horizon + 1, memory_of(config), net)
     if declaration.believes:
-        belief = BeliefBranches(history, branch_spec, features, config.believer, after_trunk=trunk is not None)
-        return BeliefActorCritic(size, net, spec, norm, trunk, whole, history=belief)
+        reads = net, branch_spec, features, trunk is not None
+        return BeliefActorCritic(
+            size, net, spec, norm, trunk, whole, actor=BeliefReader(*reads),
+            history=BeliefBranches(*reads, top=history, believer=config.believer))
 
     def branch() -> TwoBranch:
         return TwoBranch(

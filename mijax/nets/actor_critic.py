@@ -15,7 +15,7 @@ from flax import struct
 
 from envs_mjx.base import ArraySpec
 from mijax.config import CriticInput, NetworkConfig
-from mijax.nets.belief import BeliefBranches
+from mijax.nets.belief import BeliefBranches, BeliefReader
 from mijax.nets.encoders import Encoder
 from mijax.nets.heads import MLP
 from mijax.nets.privileged import PrivilegedFeatures
@@ -172,14 +172,21 @@ class TwoBranchActorCritic(_WithTrunk):
 
 
 class BeliefActorCritic(_WithTrunk):
-    """Actor and critics on samples of one belief p(z_s | h); the critics' loss and the belief's own train it."""
+    """Actor and critics on samples of one belief p(z_s | h), each with a reader of their own.
 
-    history: BeliefBranches
+    The belief is trained by the critics' loss and its own. An actor that saw it through the critics' reader could not
+    keep what it had imitated (results/robots).
+    """
+
+    actor: BeliefReader
+    history: BeliefBranches  # with the critics' reader
 
     def encode(self, tokens: Tokens, deterministic: bool = True) -> Encoded:
-        """The belief, from which the actor's gradient is kept."""
+        """The belief, from which, as from the trunk, the actor's gradient is kept."""
         belief = self.history.branches(tokens, deterministic)
-        return Encoded(jax.lax.stop_gradient(belief.both), belief.both, (BranchHeads(belief=belief.terms),))
+        seen, samples = jax.lax.stop_gradient((tokens.frames, belief.samples))
+        own = self.actor.read_tokens(samples, dataclasses.replace(tokens, frames=seen))
+        return Encoded(own, belief.both, (BranchHeads(belief=belief.terms),))
 
     def initial_state(self, batch: int) -> MemoryState:
         """The shared memory."""
@@ -189,8 +196,9 @@ class BeliefActorCritic(_WithTrunk):
         self, state: MemoryState, observation: jax.Array, previous_action: jax.Array
     ) -> tuple[MemoryState, jax.Array, jax.Array]:
         """As the base class says."""
-        state, both = self.history.step_branches(state, self.look_at(observation), previous_action)
-        return state, *self.policy(both)
+        looked = self.look_at(observation)
+        state, samples = self.history.step_samples(state, looked, previous_action)
+        return state, *self.policy(self.actor.read_observation(samples, looked))
 
 
 class PrivilegedActorCritic(ActorCritic):

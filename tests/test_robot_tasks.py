@@ -399,7 +399,7 @@ def test_a_task_whose_import_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("domain", [*DOMAINS, "drawer_opening,stop_force=12.5"])  # its expert fails twice in five there
+@pytest.mark.parametrize("domain", [*DOMAINS, "drawer_opening,stop_force=12.5"])  # where its expert fails three times in five
 def test_eighty_demonstrations_from_one_call(domain: str) -> None:
     demos = demonstrate(make(domain), jax.random.key(0), 80)
     assert demos.action.shape == (80, 50, 4)

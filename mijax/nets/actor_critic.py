@@ -174,8 +174,7 @@ class TwoBranchActorCritic(_WithTrunk):
 class BeliefActorCritic(_WithTrunk):
     """Actor and critics on samples of one belief p(z_s | h), each with a reader of their own.
 
-    The belief is trained by the critics' loss and its own. An actor that saw it through the critics' reader could not
-    keep what it had imitated (results/robots).
+    The belief is trained by the critics' loss and its own, the actor's reader by the actor's.
     """
 
     actor: BeliefReader

@@ -399,8 +399,9 @@ def test_a_task_whose_import_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("domain", [*DOMAINS, "drawer_opening,stop_force=12.5"])  # where its expert fails three times in five
+@pytest.mark.parametrize("domain", [*DOMAINS, "drawer_opening,stop_force=12.5"])
 def test_eighty_demonstrations_from_one_call(domain: str) -> None:
+    """Also where three episodes in five of the expert end in a protective stop."""
     demos = demonstrate(make(domain), jax.random.key(0), 80)
     assert demos.action.shape == (80, 50, 4)
     assert demos.success.all()

@@ -44,11 +44,11 @@ class Shapes(Environment):
         raise NotImplementedError
 
 
-def representation(env: Environment, seed: int = 5) -> Representation:
+def representation(env: Environment, seed: int = 5, features: int = FEATURES) -> Representation:
     """Untrained encoders, a mean that is not 0 and a variance that is not 1."""
     zeros = [jnp.zeros((1, *spec.shape)) for spec in (env.state_spec, env.observation_spec)]
-    parameters = init_parameters(networks_for(env, FEATURES), jax.random.key(seed), *zeros)
-    return Representation(parameters["phi"], parameters["psi"], jnp.arange(FEATURES, dtype=jnp.float32), jnp.float32(2),
+    parameters = init_parameters(networks_for(env, features), jax.random.key(seed), *zeros)
+    return Representation(parameters["phi"], parameters["psi"], jnp.arange(features, dtype=jnp.float32), jnp.float32(2),
                           jnp.zeros(2, jnp.uint32))
 
 

@@ -1,5 +1,6 @@
 """The agent of Believer: its history reaches Q only through samples of a belief p(z_s | h) (paper Appendix A.5)."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -20,11 +21,13 @@ NOISE_SEED = 20
 
 
 class _Scalar(nn.Module):
-    """One learned number, 0 at first."""
+    """One learned number."""
+
+    initial: float
 
     @nn.compact
     def __call__(self) -> jax.Array:
-        return self.param("value", nn.initializers.zeros_init(), ())
+        return self.param("value", nn.initializers.constant(self.initial), ())
 
 
 @struct.dataclass
@@ -76,6 +79,10 @@ class BeliefBranches(BeliefReader, kw_only=True):
 
     p(z_s | h) is a variational autoencoder: a summary x of the history (Table 2: 16 wide) and a standard normal latent
     (Table 2: 16) decode to z_s, standardised. In gradient passes latents are drawn afresh.
+
+    The decoder's standard deviation starts at that of a feature of z_s, whose F variances add up to 1. From 1, Adam
+    takes 1 700 updates to get there; until then a latent costs more than it tells, and on Heaven-Hell the decoder had
+    by then no unit left that was ever on, in three seeds of three: the belief said nothing of z_s for good.
     """
 
     top: HistoryEncoder
@@ -87,7 +94,7 @@ class BeliefBranches(BeliefReader, kw_only=True):
         self.summarise = nn.Dense(self.believer.history_width, dtype=dtype)
         self.posterior = MLP(net.auxiliary_hidden, 2 * self.believer.latent_width, dtype)
         self.decoder = MLP(net.auxiliary_hidden, self.features, dtype)
-        self.log_scale = _Scalar()
+        self.log_scale = _Scalar(-0.5 * math.log(self.features))
 
     def branches(self, tokens: Tokens, deterministic: bool = True) -> Belief:
         """The belief and, where `tokens.z_s` is given, standardised, the terms of the VAE."""

@@ -142,13 +142,13 @@ def shared_features(request: Request, domain: str, features: str, options: train
     return path
 
 
-def merged(arm: Arm, runs: Sequence[RunFolder], seeds: Sequence[int]) -> ReportedRun:
-    """Runs that hold different seeds of one arm, as one."""
+def merged(arm: Arm, runs: Sequence[RunFolder], begun: dict[int, int]) -> ReportedRun:
+    """Runs that hold different seeds of one arm, as one; of the seeds and after the steps that `begun` names."""
     summaries = [run.summary() or summarise(run) for run in runs]
     every = {seed: value for summary in summaries for seed, value in summary["seeds"].items()}
-    metrics = {seed: run.metrics(seed) for run in runs for seed in run.seeds() if seed in seeds}
+    metrics = {seed: run.metrics(seed) for run in runs for seed in run.seeds() if seed in begun}
     summary = summaries[0] | {"seeds": {str(seed): every[str(seed)] for seed in sorted(metrics)}}
-    return ReportedRun(arm.label, arm.colour, summary, dict(sorted(metrics.items())))
+    return ReportedRun(arm.label, arm.colour, summary, dict(sorted(metrics.items())), begun=begun)
 
 
 # -------------------------------------------------------------------------------------------------------------- figures
@@ -165,20 +165,21 @@ def note_on(request: Request, domains: Sequence[str], steps: dict[str, int]) -> 
     return "; ".join(parts)
 
 
-def stage1_samples(request: Request, domain: str, arm: Arm) -> int:
-    """Environment steps of the random policy that an arm's features were trained on: none where an expert acted."""
+def stage1_samples(request: Request, domain: str, arm: Arm) -> dict[int, int]:
+    """By seed, environment steps of the random policy that an arm's features were trained on: none where an expert
+    acted."""
     config = request.parse(domain, arm).config
     if config.stage1.data == "demonstrations" or (arm.features is None and "believer" not in arm.options):
-        return 0
-    key = jax.random.split(stage1.representation_key(request.seeds[0]), 3)[0]
-    return collect(registry.make(domain), key, config.stage1.episodes).size
+        return dict.fromkeys(request.seeds, 0)
+    env = registry.make(domain)
+    keys = {seed: jax.random.split(stage1.representation_key(seed), 3)[0] for seed in request.seeds}
+    return {seed: collect(env, key, config.stage1.episodes).size for seed, key in keys.items()}
 
 
 def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
     """Train what is missing of an experiment, domain by domain, and write its figure and table after each."""
     experiment = EXPERIMENTS[name]
     groups: dict[str, list[ReportedRun]] = {}
-    starts: dict[str, dict[str, int]] = {}
     steps: dict[str, int] = {}
     missing: dict[str, None] = {}
     for number, domain in enumerate(domains, start=1):
@@ -187,37 +188,35 @@ def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
             missing |= {arm.label: None for arm in every if arm not in arms}
             if not arms:
                 continue
-            groups[title] = [merged(arm, run_arm(request, domain, arm), request.seeds) for arm in arms]
-            starts[title] = {arm.label: stage1_samples(request, domain, arm) for arm in arms}
+            groups[title] = [
+                merged(arm, run_arm(request, domain, arm), stage1_samples(request, domain, arm)) for arm in arms]
             steps[domain] = request.parse(domain, arms[0]).config.steps
         note = note_on(request, domains[:number], steps)
         if missing:
             note += f". Left out: {', '.join(missing)}"
-        note += began(starts)
-        figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note, starts=starts)
-        write_table(name, request, experiment.title, groups, starts, note)
+        note += began(groups)
+        figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note)
+        write_table(name, request, experiment.title, groups, note)
 
 
-def began(starts: dict[str, dict[str, int]]) -> str:
-    """Whose curves begin where stage 1's random steps end, and how many these are, where it is one number."""
-    begun = {label: start for group in starts.values() for label, start in group.items() if start}
-    if not begun:
+def began(groups: dict[str, list[ReportedRun]]) -> str:
+    """Whose curves begin where stage 1's random steps end, and how many these are, where it is one domain."""
+    every = [run for runs in groups.values() for run in runs]
+    numbers = sorted({number for run in every for number in run.begun.values() if number})
+    if not numbers:
         return ""
-    numbers = set(begun.values())
-    steps = f"the {numbers.pop():,}" if len(numbers) == 1 else "the"
-    return f". Dashed vertical: {steps} random steps of stage 1 end, which come before the curve of {', '.join(begun)}"
+    ends = " to ".join(f"{number:,}" for number in sorted({numbers[0], numbers[-1]}))
+    steps = f"{ends} " if len({run.domain for run in every}) == 1 else ""
+    labels = ", ".join(dict.fromkeys(run.label for run in every if any(run.begun.values())))
+    return f". Dashed vertical: the {steps}random steps of stage 1 end, which come before the curve of {labels}"
 
 
-def write_table(
-    name: str, request: Request, title: str, groups: dict[str, list[ReportedRun]], starts: dict[str, dict[str, int]],
-    note: str
-) -> None:
+def write_table(name: str, request: Request, title: str, groups: dict[str, list[ReportedRun]], note: str) -> None:
     """OUT/NAME.md and OUT/NAME.csv."""
-    lines = [{"panel": panel, **line} for panel, runs in groups.items()
-             for line in tables.comparison_table(runs, starts[panel])]
+    lines = [{"panel": panel, **line} for panel, runs in groups.items() for line in tables.comparison_table(runs)]
     tables.write_csv(request.out / f"{name}.csv", lines)
     text = (f"# {title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
-            + "\n\n".join(f"## {panel}\n\n{tables.comparison_markdown(runs, starts[panel])}"
+            + "\n\n".join(f"## {panel}\n\n{tables.comparison_markdown(runs)}"
                           for panel, runs in groups.items()) + "\n")
     (request.out / f"{name}.md").write_text(text, encoding="utf-8")
     SAY(text)

@@ -173,17 +173,16 @@ MOST_WITH_SEEDS = 3
 
 
 def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path, *, title: str, note: str = "",
-                starts: Mapping[str, Mapping[str, int]] | None = None, panel: Panel = RETURN_AND_SUCCESS[1]) -> None:
+                panel: Panel = RETURN_AND_SUCCESS[1]) -> None:
     """Draw groups of runs side by side: above mean and standard deviation as in the paper, below interquartile means
     where a run has seeds enough (of less than four it is the mean).
 
     Args:
-        groups: the runs of each column, by its title.
+        groups: the runs of each column, by its title. A curve begins where the steps before its run end, at dashed
+            vertical lines.
         path: of the PNG.
         title: of the figure.
         note: printed under the figure: budgets and seeds.
-        starts: by group and label, the environment steps that came before the run: its curve begins there, at a dashed
-            vertical line.
         panel: the quantity, as means over the last `SMOOTH` evaluations.
     """
     every = [run for runs in groups.values() for run in runs]
@@ -198,19 +197,16 @@ def draw_groups(groups: Mapping[str, Sequence[ReportedRun]], path: pathlib.Path,
         figure = Figure(figsize=(width, 1.6 + 2.2 * len(drawings)), layout="constrained")
         axes, entries = figure.subplots(len(drawings), len(groups), sharey=True, sharex="col", squeeze=False), {}
         for (name, runs), column in zip(groups.items(), axes.T, strict=True):
-            offsets = (starts or {}).get(name, {})
             for axis, draw in zip(column, drawings.values(), strict=True):
                 for run in runs:
-                    offset = offsets.get(run.label, 0)
-                    curves = [(steps + offset, values) for steps, values in run.curves(panel.metric, SMOOTH)]
+                    curves = run.curves(panel.metric, SMOOTH)
                     if curves:
                         draw(axis, run, curves, faint=0.6 if len(runs) > 3 else 1.0)
-                for start in {start for start in offsets.values() if start}:
-                    axis.axvline(start, color="#888888", linewidth=0.9, linestyle=(0, (2, 2)), zorder=1.2)
+                for begun in {step for run in runs for step in run.begun.values() if step}:
+                    axis.axvline(begun, color="#888888", linewidth=0.9, linestyle=(0, (2, 2)), zorder=1.2)
                 _draw_optimum(axis, runs, panel)
             column[0].set_title(name)
             _label_steps(column[-1], runs, (panel,))
-            column[-1].set_xlim(0, column[-1].get_xlim()[1] + max(offsets.values(), default=0))
             entries |= dict(zip(*reversed(column[0].get_legend_handles_labels()), strict=True))
         for axis, name in zip(axes[:, 0], drawings, strict=True):
             axis.set_ylabel(f"{panel.label}\n{name}")

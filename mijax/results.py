@@ -95,6 +95,8 @@ class ReportedRun:
     """The lines of each seed."""
     folder: RunFolder | None = None
     """Where it comes from, when it is one folder's."""
+    begun: Mapping[int, int] = dataclasses.field(default_factory=dict)
+    """By seed, the random environment steps of stage 1 that its own come after, where they are to be counted."""
 
     @property
     def domain(self) -> str:
@@ -107,9 +109,17 @@ class ReportedRun:
         return self.summary.get("optimum") or {}
 
     def curves(self, name: str, smooth: int = 1) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Steps and values of each seed that has metrics called `name`, as means over the last `smooth` evaluations."""
-        found = (series(rows, name) for rows in self.metrics.values())
-        return [(steps, statistics.running_mean(values, smooth)) for steps, values in found if len(steps)]
+        """Steps, those before its own counted, and values of each seed that has metrics called `name`, as means over
+        the last `smooth` evaluations."""
+        found = ((self.begun.get(seed, 0), *series(rows, name)) for seed, rows in self.metrics.items())
+        return [(before + steps, statistics.running_mean(values, smooth))
+                for before, steps, values in found if len(steps)]
+
+    def steps_to_solve(self) -> np.ndarray:
+        """(seeds,) steps before the first solved evaluation, those before its own counted; infinity where none is."""
+        return np.array([np.inf if seed.get("steps_to_solve") is None else
+                         self.begun.get(int(number), 0) + seed["steps_to_solve"]
+                         for number, seed in self.summary["seeds"].items()], float)
 
 
 def load(paths: Sequence[pathlib.Path], labels: Sequence[str] = ()) -> list[ReportedRun]:

@@ -12,6 +12,8 @@ from mijax.results import QUANTITIES, SOLVED, ReportedRun
 
 Table = list[dict[str, Any]]
 """Lines of named cells; None is an empty one."""
+NEVER = 1e18
+"""Steps to solve, where seeds are compared, of one that never does: two such are equal."""
 
 
 def _plain(label: str) -> str:
@@ -48,12 +50,18 @@ def run_table(runs: Sequence[ReportedRun]) -> Table:
         if success.size:
             estimate = statistics.interquartile_mean_interval(success)
             line |= {"success_iqm": estimate.value, "success_iqm_low": estimate.low, "success_iqm_high": estimate.high}
-        to_solve = sorted(np.inf if seed.get("steps_to_solve") is None else seed["steps_to_solve"] for seed in seeds)
-        median = float(np.median(to_solve)) if np.isfinite(to_solve[len(to_solve) // 2]) else None
+        to_solve = run.steps_to_solve()
         wall = [sum(seconds for seconds in seed["wall"].values()) for seed in seeds]
-        line |= {"solved": int(np.isfinite(to_solve).sum()), "steps_to_solve": median, "wall": float(np.mean(wall))}
+        line |= {"solved": int(np.isfinite(to_solve).sum()), "steps_to_solve": _median(to_solve),
+                 "wall": float(np.mean(wall))}
         table.append(line)
     return table
+
+
+def _median(to_solve: np.ndarray) -> float | None:
+    """Of steps to solve; None where half of the seeds or more never did."""
+    middle = float(np.median(to_solve)) if len(to_solve) else np.inf
+    return middle if np.isfinite(middle) else None
 
 
 def markdown(runs: Sequence[ReportedRun]) -> str:
@@ -62,7 +70,7 @@ def markdown(runs: Sequence[ReportedRun]) -> str:
     return (f"{markdown_table([_readable_run(line) for line in run_table(runs)], hidden)}\n\n"
             f"{markdown_table([_readable_seed(line) for line in seed_table(runs)], hidden)}\n\n"
             f"Mean ± standard deviation over seeds; steps to the first evaluation with success >= {SOLVED} "
-            "(of a run: the median); seconds of wall time.\n")
+            "(of a run: the median), without those of stage 1; seconds of wall time.\n")
 
 
 def _readable_run(line: Mapping[str, Any]) -> dict[str, str]:
@@ -108,23 +116,17 @@ def markdown_table(lines: Sequence[Mapping[str, str]], hidden: Collection[str] =
     return "\n".join(f"| {text} |" for text in (head, rule, *body))
 
 
-def comparison_table(runs: Sequence[ReportedRun], starts: Mapping[str, int] | None = None) -> Table:
+def comparison_table(runs: Sequence[ReportedRun]) -> Table:
     """How the first of some runs, ours, compares with each: a line per run.
 
     `area` is the mean of the success curve up to the last step that all seeds reached: it tells how early a task is
-    learnt. The probability that a seed of ours beats one of theirs, ties counting half, is given by area and by the
-    steps to the first evaluation that is solved (never counts as later than any).
-
-    Args:
-        runs: ours first.
-        starts: by label, the random environment steps that a run's features were learnt on before its own steps began.
-            They count, in steps and in areas, there as steps without success.
+    learnt. Steps before the first evaluation, stage 1's and those of random actions, count as steps without success.
+    The probability that a seed of ours beats one of theirs, ties counting half, is given by area and by the steps to
+    the first evaluation that is solved, where one after that last step counts as never, and never as later than any.
     """
-    starts = starts or {}
-    begun = [starts.get(run.label, 0) for run in runs]
-    last = _last_shared(runs, starts)
-    areas = [_areas(run, start, last) for run, start in zip(runs, begun, strict=True)]
-    speeds = [_speeds(run, start) for run, start in zip(runs, begun, strict=True)]
+    last = _last_shared(runs)
+    areas = [_areas(run, last) for run in runs]
+    speeds = [-np.where(run.steps_to_solve() <= last, run.steps_to_solve(), NEVER) for run in runs]
     table = []
     for place, run in enumerate(runs):
         seeds = list(run.summary["seeds"].values())
@@ -135,54 +137,41 @@ def comparison_table(runs: Sequence[ReportedRun], starts: Mapping[str, int] | No
                 mean, std = statistics.mean_std(scores)
                 line |= {f"{name}_mean": float(mean), f"{name}_std": float(std),
                          f"{name}_iqm": float(statistics.interquartile_mean(scores))}
-        line["solved"] = int(np.sum(speeds[place] > -np.inf))
-        middle = float(np.median(-speeds[place])) if len(speeds[place]) else np.inf
-        line["steps_to_solve"] = middle if np.isfinite(middle) else None
+        to_solve = run.steps_to_solve()
+        line |= {"solved": int(np.isfinite(to_solve).sum()), "steps_to_solve": _median(to_solve)}
         if place:
             for name, scores in (("area", areas), ("steps", speeds)):
                 if len(scores[0]) and len(scores[place]):
-                    estimate = statistics.probability_of_improvement(*_finite(scores[0], scores[place]))
+                    estimate = statistics.probability_of_improvement(scores[0], scores[place])
                     line |= {f"p_{name}": float(estimate.value), f"p_{name}_low": float(estimate.low),
                              f"p_{name}_high": float(estimate.high)}
         table.append(line)
     return table
 
 
-def _last_shared(runs: Sequence[ReportedRun], starts: Mapping[str, int]) -> int:
-    """The last step that all seeds reached, those before a run counted."""
-    ends = (starts.get(run.label, 0) + int(steps[-1]) for run in runs for steps, _ in run.curves("evaluation/success"))
-    return min(ends, default=0)
+def _last_shared(runs: Sequence[ReportedRun]) -> int:
+    """The last step that all seeds reached."""
+    return min((int(steps[-1]) for run in runs for steps, _ in run.curves("evaluation/success")), default=0)
 
 
 def _column(seeds: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     return np.array([seed[name] for seed in seeds if seed.get(name) is not None], float)
 
 
-def _areas(run: ReportedRun, start: int, last: int) -> np.ndarray:
-    """(seeds,) mean success over the steps up to `last`, the first `start` of which were stage 1's."""
+def _areas(run: ReportedRun, last: int) -> np.ndarray:
+    """(seeds,) mean success over the steps up to `last`."""
     def area(steps: np.ndarray, values: np.ndarray) -> float:
         apart = (steps[-1] - steps[0]) / max(len(steps) - 1, 1)  # evaluations are evenly spaced
-        evaluations = max((last - steps[0]) // apart + 1, 1) if apart else 1
-        return float(values[start + steps <= last].sum() / evaluations)
+        evaluations = max(last // apart, 1) if apart else 1
+        return float(values[steps <= last].sum() / evaluations)
 
     return np.array([area(steps, values) for steps, values in run.curves("evaluation/success")])
 
 
-def _speeds(run: ReportedRun, start: int) -> np.ndarray:
-    """(seeds,) minus the steps to the first solved evaluation, with the `start` ones of stage 1; -inf: never."""
-    reached = [seed.get("steps_to_solve") for seed in run.summary["seeds"].values()]
-    return np.array([-np.inf if steps is None else -(start + steps) for steps in reached], float)
-
-
-def _finite(*scores: np.ndarray) -> list[np.ndarray]:
-    """-inf as a number below all others: two seeds that never solve are equal."""
-    return [np.where(np.isfinite(values), values, -1e18) for values in scores]
-
-
-def comparison_markdown(runs: Sequence[ReportedRun], starts: Mapping[str, int] | None = None) -> str:
+def comparison_markdown(runs: Sequence[ReportedRun]) -> str:
     """`comparison_table` for reading."""
     lines, first = [], _plain(runs[0].label)
-    for line in comparison_table(runs, starts):
+    for line in comparison_table(runs):
         cells = {"run": line["run"], "seeds": str(line["seeds"])}
         for name in ("success", "return", "reveals", "area"):
             if f"{name}_mean" in line:
@@ -196,12 +185,13 @@ def comparison_markdown(runs: Sequence[ReportedRun], starts: Mapping[str, int] |
                 low, high = readable(line[f"p_{name}_low"]), readable(line[f"p_{name}_high"])
                 cells[title] = f"{readable(line[f'p_{name}'])} [{low}, {high}]"
         lines.append(cells)
-    last = _last_shared(runs, starts or {})
+    last = _last_shared(runs)
     return (f"{markdown_table(lines)}\n\nMean ± standard deviation over seeds, interquartile mean (IQM). Area: mean of "
             f"the success curve up to step {last:,}, the last that all of them reached: other tables end elsewhere. "
             f"Solved: any evaluation with success >= {SOLVED}; steps to solve: those before the first one, the median "
-            "over seeds. Stage 1's random steps count, without success. P: probability that a seed of the first line "
-            "beats one of this line, ties half, with its 95 % bootstrap interval, which says little of three seeds.\n")
+            "over seeds. Stage 1's random steps count, without success, and so do an agent's own before its first "
+            "evaluation. P: probability that a seed of the first line beats one of this line, ties half, with its 95 % "
+            "bootstrap interval, which says little of three seeds.\n")
 
 
 def plain_markdown(table: Table) -> str:

@@ -32,6 +32,10 @@ class Training:
             "memory": memory_of(self.config), "seed_list": list(self.seeds), "track": self.track}
 
 
+BEFORE_THERE_WAS = (("information", "intrinsic_telescopes", False), ("dqn", "trace_tolerance", 0.0))
+"""Options that older runs do not name, and what these runs did, which is not what the option's default does now."""
+
+
 def training_of(run: RunFolder) -> Training:
     """What a run was asked for.
 
@@ -45,7 +49,8 @@ def training_of(run: RunFolder) -> Training:
     if stored["agent"] not in VARIANTS:
         raise RunError(f"{run.path}: its agent {stored['agent']!r} is another program's, accepted: mijax.train's runs")
     seeds, track = stored.pop("seed_list", ()), stored.pop("track", "none")
-    stored.setdefault("information", {}).setdefault("intrinsic_telescopes", False)  # as runs were before they could
+    for section, option, before in BEFORE_THERE_WAS:
+        stored.setdefault(section, {}).setdefault(option, before)
     return Training(config_from_dict(stored), tuple(seeds), cast(TrackerName, track))
 
 

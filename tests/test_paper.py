@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import shutil
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -175,25 +176,40 @@ def test_runs_of_other_options_are_not_taken(done: pathlib.Path, capsys: pytest.
     assert "was made with --dqn.discount 0.97, wanted 0.5" in capsys.readouterr().err
 
 
-def test_the_table_compares_ours_with_each() -> None:
-    def run(label: str, solved_at: list[int | None]) -> ReportedRun:
-        metrics = {
-            seed: [{"step": step, "evaluation/success": float(at is not None and step >= at)}
-                   for step in (10, 20, 30, 40)]
-            for seed, at in enumerate(solved_at)}
-        seeds = {str(seed): {"success": float(at is not None), "steps_to_solve": at, "wall": {}}
-                 for seed, at in enumerate(solved_at)}
-        return ReportedRun(label, "#000000", {"domain": "test", "seeds": seeds}, metrics)
+def run_solved_at(label: str, solved_at: list[int | None], steps: Sequence[int] = (10, 20, 30, 40)) -> ReportedRun:
+    metrics = {seed: [{"step": step, "evaluation/success": float(at is not None and step >= at)} for step in steps]
+               for seed, at in enumerate(solved_at)}
+    seeds = {str(seed): {"success": float(at is not None), "steps_to_solve": at, "wall": {}}
+             for seed, at in enumerate(solved_at)}
+    return ReportedRun(label, "#000000", {"domain": "test", "seeds": seeds}, metrics)
 
-    runs = [run("ours", [10, 20]), run("same", [10, 20]), run("worse", [None, 30])]
+
+def test_the_table_compares_ours_with_each() -> None:
+    runs = [run_solved_at("ours", [10, 20]), run_solved_at("same", [10, 20]), run_solved_at("worse", [None, 30])]
     ours, same, worse = tables.comparison_table(runs)
     assert (ours["area_mean"], ours["solved"]) == (0.875, 2)
     assert "p_area" not in ours
     assert (same["p_area"], same["p_steps"]) == (0.5, 0.5)
     assert (worse["p_area"], worse["p_steps"], worse["solved"]) == (1.0, 1.0, 1)
     np.testing.assert_allclose(worse["area_std"], np.std([0.0, 0.5], ddof=1))
-    text = tables.comparison_markdown([run("ours", [10, 20]), run("worse", [None, 30])])
+    text = tables.comparison_markdown([runs[0], runs[2]])
     assert "1.000 [1.000, 1.000]" in text
-    later, same, _ = tables.comparison_table(runs, {"ours": 20})  # solved at 30 and 40, two of four evaluations left
-    assert (later["area_mean"], later["steps_to_solve"]) == (0.375, 35)
-    assert (same["area_mean"], same["p_steps"], same["p_area"]) == (0.875, 0.0, 0.0)
+
+
+def test_the_table_counts_the_steps_before_a_run_by_seed() -> None:
+    ours, theirs, worse = run_solved_at("ours", [10, 20]), run_solved_at("theirs", [10, 20]), run_solved_at("w", [None])
+    later = dataclasses.replace(ours, begun={0: 20, 1: 10})  # solved at 30 and 30; two and three of four evaluations
+    assert [list(steps) for steps, _ in later.curves("evaluation/success")] == [[30, 40, 50, 60], [20, 30, 40, 50]]
+    first, second, _ = tables.comparison_table([later, theirs, worse])
+    assert (first["area_mean"], first["steps_to_solve"]) == (0.5, 30)
+    assert (second["area_mean"], second["p_steps"], second["p_area"]) == (0.875, 0.0, 0.0)
+
+    late = dataclasses.replace(ours, begun={0: 40, 1: 40})  # solved after the last step of the others: no better
+    first, *_, never = tables.comparison_table([late, theirs, worse])
+    assert (first["solved"], first["area_mean"], never["p_steps"], never["p_area"]) == (2, 0.0, 0.5, 0.5)
+
+
+def test_the_area_counts_the_random_steps_at_the_start_of_a_run() -> None:
+    warm = run_solved_at("warm", [30], steps=(30, 40))
+    first, second = tables.comparison_table([run_solved_at("ours", [30]), warm])
+    assert first["area_mean"] == second["area_mean"] == 0.5

@@ -19,7 +19,7 @@ from mijax.config import Config
 from mijax.representation.model import init_parameters, networks_for
 from mijax.representation.storage import RepresentationError, save_representation
 from mijax.run_folder import RunError, RunFolder
-from mijax.trained import Training, seed_of, seeds_of, training_of
+from mijax.trained import BEFORE_THERE_WAS, Training, seed_of, seeds_of, training_of
 from mijax.types import Representation
 
 
@@ -68,11 +68,14 @@ def test_options_seeds_and_tracker_come_back(tmp_path: pathlib.Path) -> None:
             seeds_of(run, text)
 
 
-def test_runs_from_before_bonuses_could_telescope(tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize(("section", "option", "before"), BEFORE_THERE_WAS)
+def test_runs_from_before_there_was_an_option(
+    section: str, option: str, before: object, tmp_path: pathlib.Path
+) -> None:
     stored = Training(Config(), (0,)).as_dict()
-    del stored["information"]["intrinsic_telescopes"]
-    assert Config().information.intrinsic_telescopes
-    assert not training_of(RunFolder.create(tmp_path / "run", stored)).config.information.intrinsic_telescopes
+    assert stored[section].pop(option) != before
+    read = training_of(RunFolder.create(tmp_path / "run", stored)).config
+    assert getattr(getattr(read, section), option) == before
 
 
 @pytest.mark.parametrize(("stored", "message"), [

@@ -181,7 +181,8 @@ def test_belief_learns_what_is_hidden_and_what_the_history_tells():
     state, metrics = jax.jit(lambda state, keys: jax.lax.scan(fit, state, keys))(
         jax.jit(agent.init)(jax.random.key(0), rep), jax.random.split(jax.random.key(1), 400))
     last = {name: float(np.mean(values[-50:])) for name, values in metrics.items()}
-    assert last["belief/error"] < 0.1 and last["belief/kl"] > 0.1
+    assert last["belief/error"] < 0.1
+    assert last["belief/kl"] > 0.1
 
     samples = agent.network.apply(
         {"params": state.params["agent"]}, tokens, method=lambda network, tokens: network.branches(tokens).samples)
@@ -189,7 +190,8 @@ def test_belief_learns_what_is_hidden_and_what_the_history_tells():
     right = along * side * side[0, 0]  # 1: the point that it is
     assert np.mean(right[:, told] > 0.5) > 0.8
     first = along[:, position == 0]
-    assert first.min() < -0.5 and first.max() > 0.5
+    assert first.min() < -0.5
+    assert first.max() > 0.5
 
 
 @pytest.mark.parametrize("sees", ["z_s", "z_s_z_o", "state"])

@@ -89,6 +89,7 @@ def _play_policy(
     """How (B,) episodes end, their lengths, and whether the object touched first is the movable one, -1 for neither:
     the one that is nearer to the gripper when something is touched for the first time."""
     env_state, shown = jax.vmap(env.reset)(keys)
+    keys = jax.vmap(lambda key: jax.random.fold_in(key, 3))(keys)  # 0 to 2 are `reset`'s
 
     def nearer_is_movable(env_state: RobotState) -> jax.Array:
         apart = env.object_poses(env_state)[:, :2] - env_state.qpos[None, :2]

@@ -59,6 +59,7 @@ def errors(world: RealWorld, robots: list[RobotState], gripper: bool) -> np.ndar
 def compare(options: FusionOptions) -> None:
     """Print the table."""
     require(options.gap in GAPS, "gap", options.gap, ", ".join(GAPS))
+    require(options.scenes >= 1, "scenes", options.scenes, "a number >= 1")
     if headless.bind() is None:
         raise NoOpenGL("no OpenGL without a display: the cameras need EGL or OSMesa")
     print(f"{options.scenes} scenes of each task, gap {options.gap}")
@@ -78,8 +79,12 @@ def compare(options: FusionOptions) -> None:
 def main() -> int:
     """The command; returns its exit code."""
     options = tyro.cli(FusionOptions, prog="python -m launch.fusion")
-    runtime.prepare()
-    return runtime.exit_code(lambda: compare(options))
+
+    def work() -> None:
+        runtime.prepare()
+        compare(options)
+
+    return runtime.exit_code(work)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ or steps than the paper.
 
     OUT/runs/DOMAIN/features-NAME                stage 1, shared by all runs that act on these features
     OUT/runs/DOMAIN/ARM-STEPS/seeds_K..          a run of `mijax.train`
-    OUT/FIGURE.png, OUT/FIGURE.md, OUT/FIGURE.csv
+    OUT/FIGURE.png, OUT/FIGURE.md, OUT/FIGURE.csv; OUT/FIGURE_DOMAIN.png ... with --domain
 """
 
 import argparse
@@ -56,6 +56,10 @@ class Request:
     """Further options of `mijax.train`, for all runs."""
     arms: tuple[str, ...] | None = None
     """Which of an experiment's arms, by name; None: all."""
+
+    def place(self, name: str) -> pathlib.Path:
+        """Where an experiment's figure and table go, without what their names end in."""
+        return self.out / (name if self.domain is None else f"{name}_{registry.file_name(self.domain)}")
 
     def wants(self, arm: Arm) -> bool:
         """Whether an arm is to be run and drawn."""
@@ -195,7 +199,7 @@ def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
         if missing:
             note += f". Left out: {', '.join(missing)}"
         note += began(groups)
-        figures.draw_groups(groups, request.out / f"{name}.png", title=experiment.title, note=note)
+        figures.draw_groups(groups, request.place(name).with_suffix(".png"), title=experiment.title, note=note)
         write_table(name, request, experiment.title, groups, note)
 
 
@@ -212,13 +216,13 @@ def began(groups: dict[str, list[ReportedRun]]) -> str:
 
 
 def write_table(name: str, request: Request, title: str, groups: dict[str, list[ReportedRun]], note: str) -> None:
-    """OUT/NAME.md and OUT/NAME.csv."""
+    """NAME.md and NAME.csv."""
     lines = [{"panel": panel, **line} for panel, runs in groups.items() for line in tables.comparison_table(runs)]
-    tables.write_csv(request.out / f"{name}.csv", lines)
+    tables.write_csv(request.place(name).with_suffix(".csv"), lines)
     text = (f"# {title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
             + "\n\n".join(f"## {panel}\n\n{tables.comparison_markdown(runs)}"
                           for panel, runs in groups.items()) + "\n")
-    (request.out / f"{name}.md").write_text(text, encoding="utf-8")
+    request.place(name).with_suffix(".md").write_text(text, encoding="utf-8")
     SAY(text)
 
 
@@ -253,17 +257,17 @@ def run_intrinsic(name: str, request: Request, domains: Sequence[str]) -> None:
                     index = int(informed[0]) if len(informed) else 0
                     drawn.append((domain, config.information.intrinsic_weight, seen, index))
                     draw_episode.draw_episode(
-                        seen, index, learner.domain, request.out / f"{name}_{registry.file_name(domain)}.png",
+                        seen, index, learner.domain, request.out / f"{name}_{registry.file_name(domain)}_episode.png",
                         weight=config.information.intrinsic_weight,
                         title=f"{figures.display_name(domain)}, seed {seed}, step {step:,}")
         note = note_on(request, list(steps), steps)
-        draw_episode.draw_bonuses([(figures.display_name(d), *rest) for d, *rest in drawn], request.out / f"{name}.png",
-                             title=EXPERIMENTS[name].title, note=note)
-        tables.write_csv(request.out / f"{name}.csv", lines)
+        draw_episode.draw_bonuses([(figures.display_name(d), *rest) for d, *rest in drawn],
+                                  request.place(name).with_suffix(".png"), title=EXPERIMENTS[name].title, note=note)
+        tables.write_csv(request.place(name).with_suffix(".csv"), lines)
         text = (f"# {EXPERIMENTS[name].title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
                 f"{tables.plain_markdown(lines)}\n\nPeaks at information: of the episodes that were told the hidden "
                 "variable, the share whose intrinsic reward peaks at the step that first tells it.\n")
-        (request.out / f"{name}.md").write_text(text, encoding="utf-8")
+        request.place(name).with_suffix(".md").write_text(text, encoding="utf-8")
         SAY(text)
 
 
@@ -282,6 +286,19 @@ def plan(what: str, domain: str | None) -> list[tuple[str, tuple[str, ...]]]:
     return [(name, tuple(d for d in DOMAINS[:number] if d in EXPERIMENTS[name].domains))
             for number in range(1, len(DOMAINS) + 1) for name in names
             if DOMAINS[number - 1] in EXPERIMENTS[name].domains]
+
+
+def require_meant(name: str, request: Request, domain: str) -> None:
+    """Raise `ConfigError` for an experiment that would say nothing of a domain: where its arms set what their agents do
+    not read, or where it draws discrete actions and they are not."""
+    continuous = isinstance(registry.make(domain).action_spec, ContinuousActions)
+    require(name != "fig32" or not continuous, "domain", domain, "one with discrete actions, for fig32")
+    for arm in (arm for arms in EXPERIMENTS[name].groups(domain).values() for arm in arms if request.wants(arm)):
+        config = request.parse(domain, arm).config
+        for word in (word for word in arm.options if word.startswith("--")):
+            option = word.lstrip("-").replace("-", "_").replace(".no_", ".")
+            read = reads(config, continuous, option) or option.startswith("information.")  # one may switch others off
+            require(read, "domain", domain, f"one whose {config.agent} reads {word}, which {name} changes")
 
 
 def arm_names(what: str, domain: str | None) -> list[str]:
@@ -325,6 +342,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runtime.prepare(host_devices=min(runtime.cores(), len(request.seeds)))
         if request.domain is not None:
             registry.make(request.domain)  # after `prepare`: a robot's physics starts JAX
+            for name, domains in plan(what, request.domain):
+                for domain in domains:
+                    require_meant(name, request, domain)
         request.out.mkdir(parents=True, exist_ok=True)
         for name, domains in plan(what, request.domain):
             SAY(f"== {name}: {EXPERIMENTS[name].title}: {', '.join(domains)}")

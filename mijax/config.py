@@ -1,6 +1,7 @@
 """Every option of a run, as frozen dataclasses. Presets of the six domains are in `configs/`."""
 
 import dataclasses
+import math
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -39,6 +40,14 @@ def _require_at_least(group: str, config: object, minimum: float, *names: str) -
     for name in names:
         value = getattr(config, name)
         require(value >= minimum, f"{group}{name}".replace("_", "-"), value, f"a number >= {minimum}")
+
+
+def _require_finite(options: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` for the first of the options, by their names, that is infinite or no number."""
+    for name, value in options.items():
+        numbers = value if isinstance(value, tuple) else (value,)
+        finite = all(math.isfinite(number) for number in numbers if isinstance(number, float))
+        require(finite, name.replace("_", "-"), value, "a finite number")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,6 +118,7 @@ class Stage1Config:
     whose z_s leaks it; 0.3 erases z_s altogether (measured on Heaven-Hell)."""
 
     def __post_init__(self) -> None:
+        _require_finite({f"stage1.{name}": value for name, value in dataclasses.asdict(self).items()})
         _require_at_least("stage1.", self, 1, "episodes", "heldout_episodes", "epochs", "batch_size", "features",
                           "estimator_updates")
         _require_at_least("stage1.", self, 0, "lambda_r", "lambda_s", "lambda_o", "lambda_club", "lambda_dim_s",
@@ -425,6 +435,10 @@ class CheckpointConfig:
         _require_at_least("checkpoint.", self, 2, "keep")
 
 
+MOST_STEPS = 2**31 - 1
+"""Steps are counted in 32 bits."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """A whole run."""
@@ -455,7 +469,9 @@ class Config:
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
 
     def __post_init__(self) -> None:
+        _require_finite(options_of(self))
         _require_at_least("", self, 1, "steps", "num_envs", "steps_per_iteration")
+        require(self.steps <= MOST_STEPS, "steps", self.steps, f"a number <= {MOST_STEPS}")
         steps = self.iteration_steps
         require(self.evaluation.every % steps == 0, "evaluation.every", self.evaluation.every,
                 f"a multiple of num-envs x steps-per-iteration = {steps}")
@@ -493,7 +509,8 @@ def config_from_dict(values: Mapping[str, Any]) -> Config:
 def _build(kind: Any, values: Mapping[str, Any], prefix: str) -> Any:
     types = typing.get_type_hints(kind)
     unknown = sorted(set(values) - set(types))
-    require(not unknown, prefix + (unknown[0] if unknown else ""), "a value", f"the options {', '.join(types)}")
+    if unknown:
+        raise ConfigError(f"--{prefix}{unknown[0]}: this version has no such option, accepted: {', '.join(types)}")
     built = {}
     for name, value in values.items():
         if dataclasses.is_dataclass(types[name]):

@@ -166,6 +166,8 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
     run = RunFolder.open(options.run)
     config, seeds = training_of(run).config, seeds_of(run, options.seeds)
     learner = make_learner(registry.make(config.domain), config)
+    require(options.remember <= learner.domain.horizon, "remember", options.remember,
+            f"a number <= {learner.domain.horizon}, the longest episode, or 0 for all")
     if options.text or (options.gif and not evaluate_robot.is_robot(learner.domain)):
         draw.drawable(learner.domain)  # said before the episodes are played
     actor = Forgetful(learner.agent, options.remember) if options.remember else learner.agent
@@ -185,8 +187,12 @@ def evaluate(options: EvaluateOptions) -> dict[str, dict[str, float]] | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = tyro.cli(EvaluateOptions, args=arguments, prog="python -m mijax.evaluate")
-    runtime.prepare()
-    return runtime.exit_code(lambda: evaluate(options))
+
+    def work() -> None:
+        runtime.prepare()
+        evaluate(options)
+
+    return runtime.exit_code(work)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from mijax.deploy import numpy_policy, runtimes, trace
 from mijax.deploy.numpy_policy import CONTRACT_FILE, FILES, Policy, PolicyError
 from mijax.deploy.parity import Parity, compare, play
 from mijax.deploy.step import PolicyStep, contract, policy_step
+from mijax.files import make_folder
 from mijax.learner import make_learner
 from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
@@ -99,10 +100,11 @@ def write(kind: str, agent: Agent, params: Params, out: pathlib.Path, origin: di
         PolicyError: a package is missing.
     """
     check_free(out)
+    make_folder(out.parent)
     step = policy_step(agent, params)
     partial = out.with_name(f"{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    partial.mkdir()
     try:
         save(kind, step, partial)
         digest = hashlib.sha256((partial / FILES[kind]).read_bytes()).hexdigest()
@@ -153,8 +155,12 @@ def export(options: ExportOptions) -> pathlib.Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = tyro.cli(ExportOptions, args=arguments, prog="python -m mijax.export")
-    runtime.prepare()
-    return runtime.exit_code(lambda: export(options), PolicyError)
+
+    def work() -> None:
+        runtime.prepare()
+        export(options)
+
+    return runtime.exit_code(work, PolicyError)
 
 
 if __name__ == "__main__":

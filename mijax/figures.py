@@ -93,7 +93,8 @@ def _draw_mean(axis: Axes, run: ReportedRun, curves: Sequence[tuple[np.ndarray, 
         for seed_steps, seed_values in curves if each else ():
             axis.plot(seed_steps, seed_values, color=run.colour, linewidth=0.6, alpha=0.35 * faint)
         axis.fill_between(steps, mean - std, mean + std, color=run.colour, alpha=0.16 * faint, linewidth=0)
-    axis.plot(steps, mean, color=run.colour, linewidth=1.8, label=_legend_label(run), solid_capstyle="round")
+    axis.plot(steps, mean, color=run.colour, linestyle=run.dashes, linewidth=1.8, label=_legend_label(run),
+              solid_capstyle="round")
 
 
 def _draw_interquartile_mean(axis: Axes, run: ReportedRun, curves: Sequence[tuple[np.ndarray, np.ndarray]],
@@ -102,7 +103,7 @@ def _draw_interquartile_mean(axis: Axes, run: ReportedRun, curves: Sequence[tupl
     estimate = statistics.interquartile_mean_curve(values)
     if len(curves) > 1:
         axis.fill_between(steps, estimate.low, estimate.high, color=run.colour, alpha=0.22 * faint, linewidth=0)
-    axis.plot(steps, estimate.value, color=run.colour, linewidth=1.8, solid_capstyle="round")
+    axis.plot(steps, estimate.value, color=run.colour, linestyle=run.dashes, linewidth=1.8, solid_capstyle="round")
 
 
 def _draw_optimum(axis: Axes, runs: Sequence[ReportedRun], panel: Panel) -> None:
@@ -138,7 +139,11 @@ def _add_texts(figure: Figure, axes: np.ndarray, runs: Sequence[ReportedRun], no
         entries |= dict(zip(labels, handles, strict=True))
     if "optimum" in entries:
         entries["optimum"] = entries.pop("optimum")  # last
-    columns = min(len(entries), 2 * axes.shape[1])
+    # A column takes four characters for its line, and a figure of runs that are many or long-named grows by their rows.
+    room = int(LEGEND_CHARACTERS_PER_INCH * figure.get_figwidth() / (max(map(len, entries)) + 4))
+    columns = max(1, min(len(entries), 2 * axes.shape[1], room))
+    extra = max(0, -(-len(entries) // columns) - LEGEND_ROWS)
+    figure.set_figheight(figure.get_figheight() + extra * LEGEND_ROW_INCHES)
     legend = figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=columns,
                            handlelength=1.6, title=display_name(runs[0].domain), alignment="left")
     legend.get_title().set(fontsize=12, fontweight="bold")
@@ -149,6 +154,10 @@ def _add_texts(figure: Figure, axes: np.ndarray, runs: Sequence[ReportedRun], no
 
 CHARACTERS_PER_INCH = 17
 """Of a note under a figure."""
+LEGEND_CHARACTERS_PER_INCH = 12
+LEGEND_ROWS = 2
+"""That a figure has room for as it is."""
+LEGEND_ROW_INCHES = 0.2
 PAPER_NAMES = {
     "heaven_hell": "Heaven-Hell", "sphinx": "Sphinx", "carflag_2d": "CarFlag-2D", "block_pulling": "Block-Pulling",
     "block_pushing": "Block-Pushing", "drawer_opening": "Drawer-Opening"}

@@ -3,8 +3,18 @@
 import os
 import pathlib
 
+from envs_mjx.errors import UserError
+
 ASIDE = ".part"
 """What the name of a file ends with until it is whole."""
+
+
+def make_folder(path: pathlib.Path) -> None:
+    """Make the folder that --out names, before there is anything to lose; `UserError` where that cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--out: got {path}, accepted: a folder that can be made ({error.strerror})") from None
 
 
 def write_atomically(path: pathlib.Path, content: bytes) -> None:

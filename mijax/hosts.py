@@ -35,11 +35,18 @@ class Host:
         return tuple(seeds[self.index::self.count])
 
 
-def check(hosts: str) -> None:
-    """Raise `ConfigError` unless `hosts` is what --hosts accepts, or empty."""
+def check(hosts: str, seeds: int) -> None:
+    """Raise `ConfigError` unless `hosts` is what --hosts accepts for so many seeds, or empty."""
     found = EXPLICIT.fullmatch(hosts)
     if hosts not in ("", "auto") and not (found and int(found["index"]) < int(found["count"])):
         raise ConfigError(f"--hosts: got {hosts!r}, accepted: {ACCEPTED}")
+    require_seeds(hosts, int(found["count"]) if found else 1, seeds)
+
+
+def require_seeds(hosts: str, count: int, seeds: int) -> None:
+    """Raise `ConfigError` for more hosts than there are seeds."""
+    if count > seeds:
+        raise ConfigError(f"--hosts: got {hosts!r}, accepted: at most {seeds} hosts, one for each seed, not {count}")
 
 
 def meet(hosts: str) -> Host:

@@ -32,9 +32,10 @@ from envs_mjx.grid.world import GridWorld
 from mijax import episode, page, runtime
 from mijax.draw_episode import draw_episode
 from mijax.figures import display_name, draw_curves
+from mijax.files import make_folder
 from mijax.learner import Learner, make_learner
 from mijax.page.episodes import Episodes, episode_data
-from mijax.results import ReportedRun, load
+from mijax.results import ReportedRun, evaluated, load
 from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
 from mijax.tables import markdown, run_table, seed_table, write_csv
@@ -46,7 +47,7 @@ EPISODES, EPISODES_OF_IMAGES = 4, 1
 
 def write_report(runs: Sequence[ReportedRun], out: pathlib.Path, *, smooth: int = 1, note: str = "") -> str:
     """Write the figures and tables of runs into `out`; returns the tables as markdown."""
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     domains = list(dict.fromkeys(run.domain for run in runs))
     for domain in domains:
         name = "curve.png" if len(domains) == 1 else f"curve_{registry.file_name(domain)}.png"
@@ -72,7 +73,9 @@ def report_page(runs: Sequence[ReportedRun], path: pathlib.Path, options: "Repor
             learner, seed, step, seen = _trace(folder, options.seed, _how_many(run.domain))
             shown.append(episode_data(learner, seen, seed=seed, step=step))
         except (UserError, OSError) as error:
-            shown.append(str(error).replace(str(folder.path), run.label))  # a page is sent, a path says nothing there
+            reason = str(error).replace(str(folder.path), run.label)  # a page is sent, a path says nothing there
+            shown.append(reason)
+            print(f"{run.label}: shown without episodes ({reason})", file=sys.stderr)
     page.write_page(runs, path, shown, smooth=options.smooth, note=options.note)
 
 
@@ -141,7 +144,13 @@ def draw(options: ReportOptions) -> None:
         print(f"Written to {report_episode(options)}")
         return
     out = options.out or (options.runs[0] if len(options.runs) == 1 else pathlib.Path("runs/report"))
-    runs = load(options.runs, options.labels)
+    begun = [path for path in options.runs if evaluated(path)]
+    if len(options.runs) > 1 and begun and not options.labels:  # of a sweep that goes on
+        for path in (path for path in options.runs if path not in begun):
+            print(f"{path}: left out, no evaluation yet", file=sys.stderr)
+    else:
+        begun = options.runs
+    runs = load(begun, options.labels)
     print(write_report(runs, out, smooth=options.smooth, note=options.note))
     if options.html:
         report_page(runs, out / page.FILE, options)

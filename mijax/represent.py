@@ -7,14 +7,15 @@ import argparse
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import tyro
 
 import configs
 from envs_mjx import registry
 from envs_mjx.contract import check_contract
+from envs_mjx.errors import UserError
 from mijax import runtime, stage1
 from mijax.config import Stage1Config, parse_seeds, require
 from mijax.run_folder import RunError, RunFolder
@@ -51,10 +52,18 @@ def open_run(options: RepresentOptions, seeds: Sequence[int]) -> RunFolder:
     stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
     if (path / "config.json").exists():
         run = RunFolder.open(path)
-        if run.config() == stored and not options.search:
+        other = [name for name, value in _flat(stored).items() if _flat(run.config()).get(name, value) != value]
+        if not options.search and not other:
             return run
-        raise RunError(f"{path}: was made with other options, or by a search; choose another --out")
+        named = f"with another --{other[0].replace('_', '-')}" if other else "by a search"
+        raise RunError(f"{path}: was made {named}; choose another --out")
     return RunFolder.create(path, stored)
+
+
+def _flat(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by their names on the command line, with underscores."""
+    stage1 = {f"stage1.{name}": value for name, value in dict(stored.get("stage1") or {}).items()}
+    return {name: value for name, value in stored.items() if name not in ("stage1", "seed_list")} | stage1
 
 
 def represent(options: RepresentOptions) -> None:
@@ -66,11 +75,15 @@ def represent(options: RepresentOptions) -> None:
     check_contract(env)
     run = open_run(options, seeds)
     with run.held(seeds):
-        if options.search:
-            passed = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print).best.passed
-        else:
-            stage1.representations(run, env, options.stage1, seeds, print)
-            passed = sum(stage1.passed(run, seed) for seed in seeds)
+        try:
+            if options.search:
+                passed = stage1.choose_weights(run, env, options.stage1, seeds, options.search, print).best.passed
+            else:
+                stage1.representations(run, env, options.stage1, seeds, print)
+                passed = sum(stage1.passed(run, seed) for seed in seeds)
+        except UserError:
+            run.discard(seeds)  # options that nothing can be learnt with are no run to go on with
+            raise
     if env.variables:
         print(f"{passed} of {len(seeds)} representations pass P1 and P2")
 

@@ -1,6 +1,7 @@
 """What runs came to: their summaries, and runs as they are shown together."""
 
 import dataclasses
+import os
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,6 +23,8 @@ AGENT_COLOURS = {
     "mdp": "#555555",
 }
 """The palette of Okabe and Ito, told apart by colour-blind readers; an agent keeps its colour in every figure."""
+DASHES = ("-", "--", ":", "-.")
+"""Of the lines of the first, second ... run that has the same colour."""
 
 
 def summarise(run: RunFolder, *, optimum: Mapping[str, float] | None = None,
@@ -95,6 +98,8 @@ class ReportedRun:
     """The lines of each seed."""
     folder: RunFolder | None = None
     """Where it comes from, when it is one folder's."""
+    dashes: str = "-"
+    """How its lines are drawn, in Matplotlib's terms, where several runs have its colour."""
     begun: Mapping[int, int] = dataclasses.field(default_factory=dict)
     """By seed, the random environment steps of stage 1 that its own come after, where they are to be counted."""
 
@@ -122,6 +127,12 @@ class ReportedRun:
                          for number, seed in self.summary["seeds"].items()], float)
 
 
+def evaluated(path: pathlib.Path) -> bool:
+    """Whether every seed that a run has begun has been evaluated; `RunError` where there is no run."""
+    run = RunFolder.open(path)
+    return bool(run.seeds()) and all(run.metrics(seed) for seed in run.seeds())
+
+
 def load(paths: Sequence[pathlib.Path], labels: Sequence[str] = ()) -> list[ReportedRun]:
     """Read runs, finished or not, to be shown together. Labels default to what tells the runs apart."""
     folders = [RunFolder.open(path) for path in paths]
@@ -132,12 +143,15 @@ def load(paths: Sequence[pathlib.Path], labels: Sequence[str] = ()) -> list[Repo
     if len(set(labels)) != len(labels):
         raise RunError(f"--labels: got {' '.join(labels)}, accepted: a different one for each run")
     colours = _colours([str(summary.get("agent")) for summary in summaries])
-    return [ReportedRun(label, colour, summary, {seed: folder.metrics(seed) for seed in folder.seeds()}, folder)
-            for label, colour, summary, folder in zip(labels, colours, summaries, folders, strict=True)]
+    return [ReportedRun(label, colour, summary, {seed: folder.metrics(seed) for seed in folder.seeds()}, folder,
+                        dashes=DASHES[colours[:number].count(colour) % len(DASHES)])
+            for number, (label, colour, summary, folder)
+            in enumerate(zip(labels, colours, summaries, folders, strict=True))]
 
 
 def _default_labels(folders: Sequence[RunFolder], summaries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Agent, agent and memory, folder name, whole path: the first that names each run of a domain differently."""
+    """Agent, agent and memory, folder name, path as far as paths differ: the first that names each run of a domain
+    differently."""
     choices = (
         [f"{summary['agent']}" for summary in summaries],
         [f"{summary['agent']} ({summary['memory']})" for summary in summaries],
@@ -149,7 +163,9 @@ def _default_labels(folders: Sequence[RunFolder], summaries: Sequence[Mapping[st
         if len(set(zip(domains, labels, strict=True))) == len(labels):
             unique = len(set(labels)) == len(labels)
             return labels if unique or not several else [f"{a}, {b}" for a, b in zip(labels, domains, strict=True)]
-    return [str(folder.path) for folder in folders]
+    places = [str(folder.path.resolve()) for folder in folders]
+    shared = os.path.commonpath([os.path.dirname(place) for place in places])
+    return [os.path.relpath(place, shared) for place in places]
 
 
 def _colours(agents: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import jax
 
-from envs_mjx.errors import UserError
+from envs_mjx.errors import UserError, one_line
 
 CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 INTERRUPTED = 130
@@ -36,6 +36,13 @@ def prepare(host_devices: int = 1) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     if host_devices > 1 and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         jax.config.update("jax_num_cpu_devices", host_devices)
+    asked = os.environ.get("JAX_PLATFORMS", "")
+    if asked not in ("", "cpu"):
+        try:
+            jax.devices()
+        except Exception as error:  # of a backend that is not installed JAX has several kinds, some without a message
+            raise UserError(f"JAX_PLATFORMS: got {asked!r}, accepted: one that is installed here, such as cpu "
+                            f"({one_line(error)})") from None
 
 
 def release_memory() -> None:

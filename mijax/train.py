@@ -24,7 +24,7 @@ from envs_mjx.grid.optimal import optimum
 from mijax import checkpoint, report, runtime, stage1
 from mijax.agents.variants import memory_of, needs_representation, pretrain_updates, reads, stage1_of, title_of
 from mijax.config import Config, Stage1Config, config_from_dict, options_of, parse_seeds, require
-from mijax.hosts import Host, check, meet
+from mijax.hosts import Host, check, meet, require_seeds
 from mijax.learner import Learner, make_learner
 from mijax.progress import ProgressDisplay
 from mijax.results import load, summarise
@@ -197,7 +197,7 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     """Run or go on with a training; returns its folder."""
     config, every_seed = options.config, parse_seeds(options.seeds)
     require_tracker(options.track)
-    check(options.hosts)
+    check(options.hosts, len(every_seed))
     env = registry.make(config.domain)
     check_contract(env)
     fill = None  # what cannot be trained is refused before anything is written
@@ -217,15 +217,17 @@ def train(options: TrainOptions, say: Callable[[str], None] = print) -> RunFolde
     if options.hosts:
         say(f"--hosts {options.hosts}: waiting for the other hosts")
     host = meet(options.hosts)
-    require(host.count <= len(every_seed), "hosts", options.hosts,
-            f"at most {len(every_seed)} hosts, one for each seed, and {host.count} have met")
+    require_seeds(options.hosts, host.count, len(every_seed))
     training = Training(config, host.share(every_seed), options.track)
     run = open_run(options, host, fill)
+    lost = [seed for seed in training.seeds if run.has_results(seed) and not checkpoint.exists(run, [seed])]
+    if lost:
+        raise TrainingError(f"{run.path}: seed {lost[0]} has results, but no checkpoint to go on from, and "
+                            "training it again would replace them; choose another --out")
+    if options.resume is not None and run.summary() is not None and config.steps == training_of(run).config.steps:
+        say(f"{run.path}: has ended, at its {config.steps:,} steps; --steps with more goes on")
+        return run
     with run.held(training.seeds):
-        lost = [seed for seed in training.seeds if run.has_results(seed) and not checkpoint.exists(run, [seed])]
-        if lost:
-            raise TrainingError(f"{run.path}: seed {lost[0]} has results, but no checkpoint to go on from, and "
-                                "training it again would replace them; choose another --out")
         if options.resume is not None and host.index == 0:
             run.amend(steps=config.steps, track=training.track)
         title = title_of(config, continuous=isinstance(env.action_spec, ContinuousActions))

@@ -10,7 +10,7 @@ import jax
 
 from mijax import checkpoint, stage1
 from mijax.agents.variants import VARIANTS, memory_of, needs_representation
-from mijax.config import Config, Stage1Config, config_from_dict, parse_seeds
+from mijax.config import Config, ConfigError, Stage1Config, config_from_dict, parse_seeds
 from mijax.learner import Learner, LearnerState
 from mijax.representation.storage import load_representation
 from mijax.run_folder import RunError, RunFolder
@@ -51,7 +51,10 @@ def training_of(run: RunFolder) -> Training:
     seeds, track = stored.pop("seed_list", ()), stored.pop("track", "none")
     for section, option, before in BEFORE_THERE_WAS:
         stored.setdefault(section, {}).setdefault(option, before)
-    return Training(config_from_dict(stored), tuple(seeds), cast(TrackerName, track))
+    try:
+        return Training(config_from_dict(stored), tuple(seeds), cast(TrackerName, track))
+    except ConfigError as error:
+        raise ConfigError(f"{run.path / 'config.json'}: {error}") from None
 
 
 def stage1_in(stored: Mapping[str, Any]) -> Stage1Config:
@@ -78,7 +81,8 @@ def seed_of(run: RunFolder, asked: int | None) -> int:
 def load_learner_state(run: RunFolder, seed: int, learner: Learner) -> tuple[int, LearnerState]:
     """The environment step of a seed's newest whole checkpoint, and the state there."""
     if not checkpoint.exists(run, [seed]):
-        raise RunError(f"{run.path}: seed {seed} has no checkpoint yet")
+        raise RunError(f"{run.path}: seed {seed} has no checkpoint" + (
+            ", only its published results" if run.has_results(seed) else " yet"))
     representation = None
     if needs_representation(learner.config):
         representation = load_representation(stage1.folder_of(run, seed), learner.domain)

@@ -24,6 +24,7 @@ from envs_mjx.grid import draw
 from envs_mjx.robot.gap import GAPS
 from mijax import evaluate_robot, runtime
 from mijax.config import ConfigError, require
+from mijax.files import make_folder
 from mijax.learner import Learner, LearnerState, make_learner
 from mijax.run_folder import RunError, RunFolder
 from mijax.seeds import evaluation_key
@@ -154,6 +155,7 @@ def _play(
     from envs_mjx.robot.real_trial import halves, play_beginning_with
     from envs_mjx.robot.realworld import IMMOVABLE, MOVABLE
 
+    make_folder(out)
     episodes = []
     for number in range(options.episodes):
         first = MOVABLE if number % 2 else IMMOVABLE
@@ -163,7 +165,6 @@ def _play(
     rows = halves(episodes)
     print(f"{title}: {options.episodes} episodes")
     print(table(rows))
-    out.mkdir(parents=True, exist_ok=True)
     (out / "transfer.json").write_text(json.dumps(_results(title, rows, episodes), indent=1) + "\n")
     print(f"every episode: {out / 'transfer.json'}")
     if options.gif:
@@ -209,8 +210,12 @@ def _films(
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = tyro.cli(TransferOptions, args=arguments, prog="python -m mijax.transfer")
-    runtime.prepare()
-    return runtime.exit_code(lambda: transfer(options))
+
+    def work() -> None:
+        runtime.prepare()
+        transfer(options)
+
+    return runtime.exit_code(work)
 
 
 if __name__ == "__main__":

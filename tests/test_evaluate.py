@@ -121,6 +121,7 @@ def test_what_cannot_be_evaluated_is_named(
 ):
     assert "no such run folder" in failure(capsys, str(tmp_path / "nothing"))
     assert "--remember: got -1" in failure(capsys, str(run), "--remember", "-1")
+    assert "--remember: got 51, accepted: a number <= 50" in failure(capsys, str(run), "--remember", "51")
     assert "--episodes: got 0" in failure(capsys, str(run), "--episodes", "0")
     assert "has no seed 7 (it has 0, 3)" in failure(capsys, str(run), "--seeds", "0,7")
     fresh = RunFolder.create(tmp_path / "fresh", Training(CONFIG, (0,)).as_dict())
@@ -131,5 +132,8 @@ def test_what_cannot_be_evaluated_is_named(
     representation = RunFolder.create(tmp_path / "represented", {"domain": "sphinx", "stage1": {}})
     assert "holds representations but no agent" in failure(capsys, str(representation.path))
     stored = json.loads((fresh.path / "config.json").read_text())
+    (fresh.path / "config.json").write_text(json.dumps(stored | {"sac": {"wings": 2}}))
+    message = f"{fresh.path / 'config.json'}: --sac.wings: this version has no such option"
+    assert message in failure(capsys, str(fresh.path))
     (fresh.path / "config.json").write_text(json.dumps(stored | {"domain": "mars"}))
     assert "'mars'" in failure(capsys, str(fresh.path))

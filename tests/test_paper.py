@@ -92,11 +92,11 @@ def contents(out: pathlib.Path) -> dict[pathlib.Path, tuple[int, int]]:
 
 @pytest.mark.slow
 def test_an_experiment_leaves_its_figure_and_table(done: pathlib.Path) -> None:
-    text = (done / "fig5.md").read_text()
+    text = (done / "fig5_heaven_hell.md").read_text()
     assert "1 seed, 600 steps (paper: 5 seeds, 500,000 steps)" in text
     assert "P(Ours better), area" in text
     assert "--steps 600" in text
-    with Image.open(done / "fig5.png") as image:
+    with Image.open(done / "fig5_heaven_hell.png") as image:
         assert min(image.size) > 300
     places = {path.parent.parent.name for path in done.glob("runs/heaven_hell/*/*/summary.json")}
     assert places == {"mi-600", "mi-gru-600"}
@@ -115,14 +115,15 @@ def test_what_is_there_is_not_made_again_and_seeds_are_added(done: pathlib.Path)
     after = contents(done)
     assert before.items() <= after.items()
     assert RunFolder.open(done / "runs/heaven_hell/mi-600/seeds_1").seeds() == (1,)
-    assert {path.name for path in done.glob("fig32*")} >= {"fig32.png", "fig32.md", "fig32_heaven_hell.png"}
-    assert "| heaven_hell | 1 " in (done / "fig32.md").read_text()
+    assert {path.name for path in done.glob("fig32*")} >= {"fig32_heaven_hell.png", "fig32_heaven_hell.md",
+                                                             "fig32_heaven_hell_episode.png"}
+    assert "| heaven_hell | 1 " in (done / "fig32_heaven_hell.md").read_text()
 
 
 @pytest.mark.slow
 def test_an_arm_can_be_left_out(done: pathlib.Path) -> None:
     assert paper.main(["fig5", "--seeds", "1", "--arms", "mi", *command(done)]) == 0
-    text = (done / "fig5.md").read_text()
+    text = (done / "fig5_heaven_hell.md").read_text()
     assert "Left out: Ours with a GRU" in text
     assert "--arms mi" in text
 
@@ -158,6 +159,8 @@ def test_a_run_that_was_stopped_goes_on(done: pathlib.Path, monkeypatch: pytest.
     (["fig3", "--seeds", "x"], "--seeds: got 'x'"),
     (["fig3", "--steps", "0"], "--steps: got 0"),
     (["fig3", "--arms", "mi,me"], "--arms: got 'mi,me', accepted: some of mi,base,zp,ba,ua,believer"),
+    (["fig32", "--domain", "block_pulling"], "--domain: got 'block_pulling', accepted: one with discrete actions"),
+    (["parts", "--domain", "heaven_hell"], "one whose mi reads --sac.rotated-copies, which parts changes"),
     (["fig3", "--agent", "mi"], "--agent: got 'a value', accepted: nothing here"),
     (["fig3", "--hosts", "auto"], "--hosts: got 'a value', accepted: nothing here"),
 ])

@@ -113,6 +113,47 @@ def test_labels_tell_runs_apart(tmp_path):
     assert [run.label for run in results.load(paths, ["x", "y", "z"])] == ["x", "y", "z"]
 
 
+def test_runs_of_one_colour_have_other_dashes_and_short_names(tmp_path):
+    for number in range(9):
+        make_run(tmp_path / f"sweep-{number}" / "run")
+    runs = results.load(sorted(tmp_path.glob("*/run")))
+    assert [run.label for run in runs] == [f"sweep-{number}/run" for number in range(9)]
+    assert len({(run.colour, run.dashes) for run in runs}) == 9
+
+
+def test_the_legend_of_many_runs_is_whole(tmp_path, monkeypatch):
+    long = "network.gru-width=128-information.auxiliary-weight=0.5"
+    for number in range(8):
+        make_run(tmp_path / f"{long}-{number}")
+    figures_made = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *arguments: (figures_made.append(self), save(self, *arguments)))
+    report.write_report(results.load(sorted(tmp_path.glob("network*"))), tmp_path / "out")
+    figure, = figures_made
+    legend, inside = figure.legends[0].get_window_extent(), figure.bbox
+    assert len(figure.legends[0].get_texts()) == 9  # with the optimum
+    assert inside.x0 <= legend.x0 < legend.x1 <= inside.x1
+    assert inside.y0 <= legend.y0 < legend.y1 <= inside.y1 + 1
+
+
+def test_runs_that_have_no_evaluation_yet_are_left_out(tmp_path, capsys):
+    make_run(tmp_path / "a")
+    fresh = make_run(tmp_path / "b", agent="base", seeds=(0,), finished=False)
+    fresh.truncate_after(-1, (0,))
+    assert report.main([str(tmp_path / "a"), str(fresh.path), "--out", str(tmp_path / "out")]) == 0
+    assert f"{fresh.path}: left out, no evaluation yet" in capsys.readouterr().err
+    assert {line["run"] for line in read_csv(tmp_path / "out" / "runs.csv")} == {"mi"}
+    assert report.main([str(fresh.path), "--out", str(tmp_path / "out")]) == 1
+    assert "no evaluation yet" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path, capsys):
+    make_run(tmp_path / "a")
+    (tmp_path / "file").touch()
+    assert report.main([str(tmp_path / "a"), "--out", str(tmp_path / "file" / "out")]) == 1
+    assert "--out: got" in capsys.readouterr().err
+
+
 def test_domains_have_figures_of_their_own(tmp_path):
     make_run(tmp_path / "a")
     make_run(tmp_path / "b", domain="mine.envs:Maze", seeds=(0,))

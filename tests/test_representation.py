@@ -506,9 +506,17 @@ def test_the_command_learns_probes_and_keeps(tmp_path, capsys):
     assert "of 1 representations pass" in capsys.readouterr().out
     assert (folder / "representation.msgpack").stat().st_mtime_ns == made
     assert represent.main(["--domain", "heaven_hell", *options, "--stage1.lambda-r", "2"]) == 1
-    assert "was made with other options" in capsys.readouterr().err
+    assert "was made with another --stage1.lambda-r; choose another --out" in capsys.readouterr().err
     assert represent.main(["--domain", "heaven_hell", *options, "--search", "2"]) == 1
     assert "choose another --out" in capsys.readouterr().err
+
+
+@pytest.mark.lenient
+def test_options_that_nothing_can_be_learnt_with_leave_no_folder(tmp_path, capsys):
+    options = ["--stage1.epochs", "2", "--stage1.episodes", "20", "--stage1.learning-rate", "1e9"]
+    assert represent.main(["--domain", "heaven_hell", *options, "--out", str(tmp_path / "run")]) == 1
+    assert "try a smaller --stage1.learning-rate" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("options", [["--domain", "nowhere"], ["--seeds", "x"], ["--seeds", "0"]])

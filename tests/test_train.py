@@ -223,7 +223,7 @@ def test_bad_seeds(text: str) -> None:
 def test_a_stored_configuration_comes_back() -> None:
     config = Config(domain="sphinx", steps=123_000)
     assert config_from_dict(json.loads(json.dumps(dataclasses.asdict(config)))) == config
-    with pytest.raises(ConfigError, match=r"dqn\.wrong"):
+    with pytest.raises(ConfigError, match=r"--dqn\.wrong: this version has no such option"):
         config_from_dict({"dqn": {"wrong": 1}})
     with pytest.raises(ConfigError, match=r"information\.intrinsic-form: got 'most'"):
         config_from_dict({"information": {"intrinsic_form": "most"}})
@@ -234,6 +234,9 @@ def test_a_stored_configuration_comes_back() -> None:
     (["--agent", "best"], "--agent"),
     (["--dqn.batch-episodes", "7"], "--dqn.batch-episodes"),
     (["--steps", "-5"], "--steps"),
+    (["--steps", "99999999999"], "accepted: a number <= 2147483647"),
+    (["--dqn.learning-rate", "inf"], "--dqn.learning-rate: got inf, accepted: a finite number"),
+    (["--stage1.lambda-r", "nan"], "--stage1.lambda-r: got nan"),
     (["--agent", "base", "--steps", "2000"], "more than the 2000 of the warm-up"),
     (["--stage1.heldout-episodes", "1"], "--stage1.heldout-episodes"),
     (["--stage1.data", "demonstrations"], "--stage1.data"),
@@ -247,6 +250,7 @@ def test_a_stored_configuration_comes_back() -> None:
     (["--domain", "json:dumps"], "json"),
     (["--hosts", "here"], "--hosts"),
     (["--hosts", "10.0.0.1:4321,2,2"], "an index below the count"),
+    (["--hosts", "10.0.0.1:4321,0,2"], "at most 1 hosts, one for each seed, not 2"),
 ])
 def test_bad_input_is_one_line_and_leaves_nothing(
     arguments: list[str], named: str, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
@@ -305,6 +309,13 @@ def test_seeds_that_are_not_abreast_go_on_one_after_the_other(
     assert comparable(path, 3) == comparable(whole_run, 3)
     there, alone = (json.loads((run / "summary.json").read_text())["seeds"] for run in (path, whole_run))
     assert without_seconds(there) == without_seconds(alone)
+
+
+def test_a_run_that_has_ended_is_left_as_it_is(whole_run: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")}
+    assert train.main(["--resume", str(whole_run)]) == 0
+    assert "has ended, at its 1,200 steps" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")} == before
 
 
 def test_results_without_a_checkpoint_are_not_replaced(

@@ -57,9 +57,9 @@ class Request:
     arms: tuple[str, ...] | None = None
     """Which of an experiment's arms, by name; None: all."""
 
-    def place(self, name: str) -> pathlib.Path:
-        """Where an experiment's figure and table go, without what their names end in."""
-        return self.out / (name if self.domain is None else f"{name}_{registry.file_name(self.domain)}")
+    def place(self, name: str, ending: str) -> pathlib.Path:
+        """Where an experiment's figure or table goes, by what its name ends in."""
+        return self.out / (name + ("" if self.domain is None else f"_{registry.file_name(self.domain)}") + ending)
 
     def wants(self, arm: Arm) -> bool:
         """Whether an arm is to be run and drawn."""
@@ -199,7 +199,7 @@ def run_curves(name: str, request: Request, domains: Sequence[str]) -> None:
         if missing:
             note += f". Left out: {', '.join(missing)}"
         note += began(groups)
-        figures.draw_groups(groups, request.place(name).with_suffix(".png"), title=experiment.title, note=note)
+        figures.draw_groups(groups, request.place(name, ".png"), title=experiment.title, note=note)
         write_table(name, request, experiment.title, groups, note)
 
 
@@ -218,11 +218,11 @@ def began(groups: dict[str, list[ReportedRun]]) -> str:
 def write_table(name: str, request: Request, title: str, groups: dict[str, list[ReportedRun]], note: str) -> None:
     """NAME.md and NAME.csv."""
     lines = [{"panel": panel, **line} for panel, runs in groups.items() for line in tables.comparison_table(runs)]
-    tables.write_csv(request.place(name).with_suffix(".csv"), lines)
+    tables.write_csv(request.place(name, ".csv"), lines)
     text = (f"# {title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
             + "\n\n".join(f"## {panel}\n\n{tables.comparison_markdown(runs)}"
                           for panel, runs in groups.items()) + "\n")
-    request.place(name).with_suffix(".md").write_text(text, encoding="utf-8")
+    request.place(name, ".md").write_text(text, encoding="utf-8")
     SAY(text)
 
 
@@ -262,12 +262,12 @@ def run_intrinsic(name: str, request: Request, domains: Sequence[str]) -> None:
                         title=f"{figures.display_name(domain)}, seed {seed}, step {step:,}")
         note = note_on(request, list(steps), steps)
         draw_episode.draw_bonuses([(figures.display_name(d), *rest) for d, *rest in drawn],
-                                  request.place(name).with_suffix(".png"), title=EXPERIMENTS[name].title, note=note)
-        tables.write_csv(request.place(name).with_suffix(".csv"), lines)
+                                  request.place(name, ".png"), title=EXPERIMENTS[name].title, note=note)
+        tables.write_csv(request.place(name, ".csv"), lines)
         text = (f"# {EXPERIMENTS[name].title}\n\n{note}\n\n    {command_line(name, request)}\n\n"
                 f"{tables.plain_markdown(lines)}\n\nPeaks at information: of the episodes that were told the hidden "
                 "variable, the share whose intrinsic reward peaks at the step that first tells it.\n")
-        request.place(name).with_suffix(".md").write_text(text, encoding="utf-8")
+        request.place(name, ".md").write_text(text, encoding="utf-8")
         SAY(text)
 
 

@@ -47,6 +47,13 @@ def test_experiments_share_their_runs() -> None:
     assert {arm.features for arm in believers} == {"believer", None}
 
 
+def test_figures_of_a_domain_have_its_name() -> None:
+    every = paper.Request(pathlib.Path("out"), None, (0,), None, ())
+    one = dataclasses.replace(every, domain="examples.signpost:Signpost")
+    assert [str(request.place("fig3", ".md")) for request in (every, one)] == [
+        "out/fig3.md", "out/fig3_examples.signpost.Signpost.md"]
+
+
 def test_who_looks_through_whose_features() -> None:
     """On robots every agent looks through psi's body; Believer's is its own."""
     request = paper.Request(pathlib.Path("nowhere"), None, (0,), None, ())

@@ -75,7 +75,7 @@ def report_page(runs: Sequence[ReportedRun], path: pathlib.Path, options: "Repor
         except (UserError, OSError) as error:
             reason = str(error).replace(str(folder.path), run.label)  # a page is sent, a path says nothing there
             shown.append(reason)
-            print(f"{run.label}: shown without episodes ({reason})", file=sys.stderr)
+            print(f"shown without episodes: {reason}", file=sys.stderr)
     page.write_page(runs, path, shown, smooth=options.smooth, note=options.note)
 
 

@@ -82,7 +82,7 @@ def load_learner_state(run: RunFolder, seed: int, learner: Learner) -> tuple[int
     """The environment step of a seed's newest whole checkpoint, and the state there."""
     if not checkpoint.exists(run, [seed]):
         raise RunError(f"{run.path}: seed {seed} has no checkpoint" + (
-            ", only its published results" if run.has_results(seed) else " yet"))
+            ", only results" if run.has_results(seed) else " yet"))
     representation = None
     if needs_representation(learner.config):
         representation = load_representation(stage1.folder_of(run, seed), learner.domain)

@@ -185,8 +185,10 @@ def test_images_become_small_pictures() -> None:
 def test_the_command_tells_why_there_is_no_episode(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path / "run", "mi", 2)
     assert report.main([str(run.path), "--html"]) == 0
-    assert str(run.path / page.FILE) in capsys.readouterr().out
-    assert "seed 0 has no checkpoint yet" in page.read_data(run.path / page.FILE)["runs"][0]["episodes"]
+    said = capsys.readouterr()
+    assert str(run.path / page.FILE) in said.out
+    assert "shown without episodes: mi: seed 0 has no checkpoint, only results" in said.err
+    assert "seed 0 has no checkpoint, only results" in page.read_data(run.path / page.FILE)["runs"][0]["episodes"]
     for arguments, message in (
         (["--html", "--episode"], "--html: got it with --episode"),
         (["--html", "--seed", "9"], "has no seed 9 (it has 0, 1, 2)"),

@@ -37,8 +37,11 @@ REWARD_DECODED = 0.9
 """The dynamics model must explain this fraction of the variance of rewards, which are rare events."""
 RIDGE = 1e-6
 """Ridge penalty per row, on directions of variance 1."""
-MLP_WIDTH, MLP_STEPS, MLP_STEP_SIZE = 64, 300, 1e-2
-"""Two hidden layers, full-batch Adam: the whole probe took 13 s of one core on Heaven-Hell, compilation included."""
+MLP_WIDTH, MLP_STEP_SIZE = 64, 1e-2
+"""Two hidden layers, and the first step size of Adam."""
+MLP_PASSES, MLP_BATCH = 300, 2048
+"""Passes over the rows that a network is fitted to, so many of them at a time. Full batches left the goal of
+CarFlag-2D, with 23 000 rows, at R2 0.95 to 0.98 where these find 0.985; the other domains have fewer rows than one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,14 +243,22 @@ def _fit_mlp(x: np.ndarray, y: np.ndarray, fitted: np.ndarray, key: jax.Array) -
         return np.zeros_like(y)
     weights = [(jax.random.normal(k, (i, o)) * np.sqrt(2 / i).astype(np.float32), jnp.zeros((1, o)))
                for k, i, o in zip(jax.random.split(key, 3), widths[:-1], widths[1:], strict=True)]
-    # Grid worlds have few distinct rows. Padding to a power of two keeps the number of compilations small.
+    # Grid worlds have few distinct rows.
     rows, inverse = np.unique(np.concatenate([x, y], axis=1), axis=0, return_inverse=True)
     inverse = inverse.reshape(-1)
-    table = np.zeros((1 << max(5, int(len(rows) - 1).bit_length()), rows.shape[1]), np.float32)
-    table[: len(rows)] = rows
-    weight = np.bincount(inverse, fitted / fitted.sum(), len(table)).astype(np.float32)
-    guess = _train_mlp(weights, *map(jnp.asarray, (table[:, : x.shape[1]], table[:, x.shape[1] :], weight)))
+    weight = np.bincount(inverse, fitted / fitted.sum(), len(rows))
+    known = weight > 0
+    every, known_rows, known_weight = _padded(rows), _padded(rows[known]), _padded(weight[known])
+    inputs = x.shape[1]
+    guess = _train_mlp(weights, known_rows[:, :inputs], known_rows[:, inputs:], known_weight, every[:, :inputs])
     return np.asarray(guess, np.float64)[inverse]
+
+
+def _padded(rows: np.ndarray) -> jax.Array:
+    """float32, with zeros after the last row up to a power of two, which keeps the number of compilations small."""
+    result = np.zeros((1 << max(5, int(len(rows) - 1).bit_length()), *rows.shape[1:]), np.float32)
+    result[: len(rows)] = rows
+    return jnp.asarray(result)
 
 
 def _apply_mlp(weights: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> jax.Array:
@@ -258,21 +269,26 @@ def _apply_mlp(weights: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> jax.
 
 @jax.jit
 def _train_mlp(
-    weights: list[tuple[jax.Array, jax.Array]], x: jax.Array, y: jax.Array, weight: jax.Array
+    weights: list[tuple[jax.Array, jax.Array]], x: jax.Array, y: jax.Array, weight: jax.Array, asked: jax.Array
 ) -> jax.Array:
-    """(N, W) predictions after `MLP_STEPS` steps on rows of (N,) `weight`."""
-    optimizer = optax.adam(optax.cosine_decay_schedule(MLP_STEP_SIZE, MLP_STEPS))
+    """(M, W) predictions for (M, F) `asked`, fitted to N rows of (N,) `weight`, which sum to 1."""
+    parts = max(1, len(x) // MLP_BATCH)
+    optimizer = optax.adam(optax.cosine_decay_schedule(MLP_STEP_SIZE, MLP_PASSES * parts))
 
-    def loss(weights: list) -> jax.Array:
-        return weight @ jnp.sum(jnp.square(_apply_mlp(weights, x) - y), axis=1)
+    def step(carry: tuple, rows: jax.Array) -> tuple[tuple, None]:
+        def loss(weights: list) -> jax.Array:
+            return parts * weight[rows] @ jnp.sum(jnp.square(_apply_mlp(weights, x[rows]) - y[rows]), axis=1)
 
-    def step(carry: tuple, _: None) -> tuple[tuple, None]:
         weights, state = carry
         updates, state = optimizer.update(jax.grad(loss)(weights), state)
         return (optax.apply_updates(weights, updates), state), None
 
-    (weights, _), _ = jax.lax.scan(step, (weights, optimizer.init(weights)), None, length=MLP_STEPS)
-    return _apply_mlp(weights, x)
+    def one_pass(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+        return jax.lax.scan(step, carry, jax.random.permutation(key, len(x)).reshape(parts, -1))
+
+    keys = jax.random.split(jax.random.key(0), MLP_PASSES)
+    (weights, _), _ = jax.lax.scan(one_pass, (weights, optimizer.init(weights)), keys)
+    return _apply_mlp(weights, asked)
 
 
 def _score(variable: Variable, guess: np.ndarray, actual: np.ndarray) -> float:

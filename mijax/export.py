@@ -87,7 +87,7 @@ def write(kind: str, agent: Agent, params: Params, out: pathlib.Path, origin: di
         kind: a key of `FILES`.
         agent: on the environment in which it is to be compared.
         params: of its network.
-        out: folder; one that holds an earlier export is replaced once the new one has passed.
+        out: folder; an earlier export in it is replaced once the new one has passed, and other files there stay.
         origin: what the contract says of the run.
         key: draws the episodes.
         episodes: how many.
@@ -99,6 +99,7 @@ def write(kind: str, agent: Agent, params: Params, out: pathlib.Path, origin: di
         RunError: the folder holds something else, the format cannot hold the network, or actions differ.
         PolicyError: a package is missing.
     """
+    out = out.resolve()
     check_free(out)
     make_folder(out.parent)
     step = policy_step(agent, params)
@@ -113,9 +114,11 @@ def write(kind: str, agent: Agent, params: Params, out: pathlib.Path, origin: di
         policy = Policy.load(partial)
         found = compare(policy, play(agent, params, key, episodes))
         _write_contract(partial, described | {"parity": dataclasses.asdict(found)})
-        if out.exists():
-            shutil.rmtree(out)
-        partial.rename(out)
+        out.mkdir(exist_ok=True)
+        for path in sorted(partial.iterdir(), key=lambda path: path.name == CONTRACT_FILE):  # it makes the rest valid
+            path.replace(out / path.name)
+        for name in set(FILES.values()) - {FILES[kind]}:
+            (out / name).unlink(missing_ok=True)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return policy, found

@@ -230,7 +230,12 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--host", default="127.0.0.1",
                         help="address to listen on; nobody is asked for a password, so keep to networks you trust")
     parser.add_argument("--connections", type=int, default=16, help="at most so many at a time")
-    return parser.parse_args(list(arguments))
+    options = parser.parse_args(list(arguments))
+    if options.port is not None and not 0 <= options.port < 2**16:
+        parser.error(f"--port: got {options.port}, accepted: 0 to {2**16 - 1}")
+    if options.connections < 1:
+        parser.error(f"--connections: got {options.connections}, accepted: a number >= 1")
+    return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -241,7 +246,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.port is None:
             converse(policy, sys.stdin.buffer, sys.stdout.buffer)
             return 0
-        server = Server((options.host, options.port), policy, max(1, options.connections))
+        server = Server((options.host, options.port), policy, options.connections)
     except (PolicyError, OSError, OverflowError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from gymnax.environments import spaces as gymnax_spaces
+from gymnax.wrappers import FlattenObservationWrapper
 
 from envs_mjx import registry
 from envs_mjx.adapters.gymnasium import AsGymnasium, FromGymnasium
@@ -91,6 +93,21 @@ def test_gymnax_bounds_and_time_limits():
 def test_what_does_not_fit_is_named():
     with pytest.raises(ValueError, match="no field 'contex', accepted: time, context"):
         FromGymnax(*gymnax.make("MemoryChain-bsuite"), hidden=("contex",))
+    env, params = gymnax.make("Catch-bsuite")
+    with pytest.raises(ValueError, match="FlattenObservationWrapper is no environment of gymnax"):
+        FromGymnax(FlattenObservationWrapper(env), params)  # pyright: ignore[reportArgumentType]
+    endless, params = gymnax.make("Pendulum-v1")
+    endless.action_space = lambda params=None: gymnax_spaces.Box(-np.inf, np.inf, (1,))
+    with pytest.raises(ValueError, match="or a flat Box with bounds"):
+        FromGymnax(endless, params)
+
+
+@pytest.mark.lenient
+def test_gymnax_observations_of_other_shapes_are_flattened():
+    for name, size in (("Catch-bsuite", 50), ("DeepSea-bsuite", 64)):
+        env = FromGymnax(*gymnax.make(name), horizon=5)
+        assert env.observation_spec.shape == (size,)
+        check_contract(env)
 
 
 def play(env: FromGymnasium, keys: jax.Array, actions: jax.Array) -> tuple:
@@ -173,6 +190,12 @@ class Forgetting(TMaze):
         return self._show()
 
 
+class Turning(TMaze):
+    """Acts with whole numbers."""
+
+    action_space = spaces.Box(0, 3, (2,), np.int64)  # pyright: ignore[reportAssignmentType]
+
+
 class Talking(TMaze):
     """Observes text."""
 
@@ -190,6 +213,59 @@ def test_what_does_not_fit_of_gymnasium_is_named():
         FromGymnasium(Forgetting, horizon=9, state="state")
     with pytest.raises(ValueError, match="one for each of the state's 2 numbers"):
         FromGymnasium(TMaze, horizon=9, variables=(Variable("place", hidden=False),))
+    with pytest.raises(ValueError, match="horizon: got 0, accepted: a number of steps >= 1"):
+        FromGymnasium(TMaze, horizon=0)
+    with pytest.raises(ValueError, match=r"make: got <.*TMaze.*>, accepted: a callable"):
+        FromGymnasium(TMaze(), horizon=9)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="a flat Box of real numbers with bounds"):
+        FromGymnasium(Turning, horizon=9)
+
+
+class Counted(TMaze):
+    """Counts how many there are."""
+
+    open = 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        Counted.open += 1
+
+    def close(self) -> None:
+        Counted.open -= 1
+
+
+def test_simulators_of_a_large_batch_are_given_back():
+    env = FromGymnasium(Counted, horizon=3, state="state", room=8)
+    assert Counted.open == 0
+    keys, actions = jax.random.split(jax.random.key(0), 40), jnp.zeros((3, 40), jnp.int32)
+    _, steps = play(env, keys, actions)
+    assert Counted.open >= 40
+    for seed in range(4):
+        play(env, jax.random.split(jax.random.key(seed), 2), actions[:, :2])
+    assert Counted.open <= 8
+    _, again = play(env, keys, actions)
+    jax.tree.map(np.testing.assert_array_equal, steps, again)
+    env.close()
+    assert Counted.open == 0
+
+
+@pytest.mark.parametrize("seed", [2**31, 2**32, 2**63 + 5, 2**70])
+def test_seeds_of_gymnasium_have_any_number_of_bits(seed: int):
+    env, same, small = (AsGymnasium("heaven_hell") for _ in range(3))
+    sides, others, smalls = ([e.reset(seed=s if i == 0 else None)[1]["state"][2] for i in range(24)]
+                             for e, s in ((env, seed), (same, seed), (small, seed % 2**31)))
+    assert sides == others
+    assert sides != smalls
+
+
+def test_actions_and_arrays_from_the_host():
+    env = AsGymnasium("heaven_hell")
+    seen, info = env.reset(seed=0)
+    seen -= 1  # arrays are the caller's
+    info["state"] -= 1
+    for action in (7, -3, 1.7):
+        with pytest.raises(gymnasium.error.InvalidAction, match=r"accepted: Discrete\(4\)"):
+            env.step(action)
 
 
 @pytest.mark.slow

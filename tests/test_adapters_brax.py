@@ -203,6 +203,8 @@ def test_what_cannot_be_ours_is_named():
         FromBrax(training.AutoResetWrapper(fast.Fast()), horizon=4)
     with pytest.raises(ValueError, match="shows no 'pixels', accepted: privileged_state, state"):
         FromBrax(Cart(), horizon=4, observation_key="pixels")
+    with pytest.raises(ValueError, match="state_key: Cart shows no 'priviledged_state', accepted: "):
+        FromBrax(Cart(), horizon=4, state_key="priviledged_state")
     with pytest.raises(ValueError, match="accepted: numbers from 0 to 1"):
         FromBrax(fast.Fast(), horizon=4, observed=(2,))
     with pytest.raises(ValueError, match="one for each of the state's 2 numbers"):

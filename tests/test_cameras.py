@@ -228,9 +228,12 @@ def test_text_clouds(recorded: pathlib.Path) -> None:
     ("left.npz", {"depth": np.zeros((4, 4, 3), np.float32)}, "expected one channel of 16 bits, or floats"),
     ("left.npz", {"depth": np.zeros((4, 4), np.float32)}, "4 x 4 pixels: expected 240 x 320, as calibrated"),
     ("front.npz", {"depth": np.zeros((4, 4), np.float32)}, "no camera 'front' in the calibration: it has left, right"),
+    ("left.npz", {"depth": np.array([["a", "b"]])}, "expected one channel of 16 bits, or floats"),
+    ("left.npz", {"depth": np.zeros((ROWS, COLUMNS), np.float32)}, "expected files that measured something"),
     ("left.png", b"", "no depth image"),
     ("left.npz", b"PK\x03\x04 torn", "no depth image"),
     ("left.ply", b"ply\n", "not a PLY file"),
+    ("left.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty\nend_header\n1", "x, y and z among them"),
     ("left.ply", b"ply\nformat ascii 1.0\nelement vertex\nend_header\n1", "how many vertices"),
     ("left.ply", b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
                  b"end_header\n1 2 3\n", "torn: expected 2 vertices"),
@@ -251,6 +254,41 @@ def test_files_that_cannot_be_used_are_named(
     assert message in error
     assert name in error
     assert len(error.splitlines()) == 1
+
+
+def test_clouds_of_other_systems(recorded: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    (tmp_path / "text.ply").write_bytes((recorded / "text.ply").read_bytes().replace(b"\n", b"\r\n"))
+    np.testing.assert_array_equal(camera_files.read_ply(tmp_path / "text.ply"), [[1, 2, 0.25], [3, 4, 0.5]])
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (("--gripper", "nan", "0", "0.2", "0"), "--gripper: got nan 0.0 0.2 0.0, accepted: finite numbers"),
+    (("--out", "{}/left.png/seen"), "left.png"),
+])
+def test_options_that_cannot_be_used_are_named(
+    recorded: pathlib.Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], message: str
+) -> None:
+    arguments = [str(recorded / "left.png"), "--calibration", str(recorded / "cameras.json"), "--domain",
+                 "block_pulling", "--gripper", *map(str, GRIPPER), *(option.format(recorded) for option in options)]
+    assert camera_files.main(arguments) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("entry", "message"), [
+    ({"fx": 0}, "camera 'left': expected finite numbers, and fx"), ({"depth_unit": -1}, "depth_unit above 0"),
+    ({"cx": "nan"}, "camera 'left': expected finite numbers"), ({"name": "right"}, "two cameras of the name 'right'"),
+    ({"pose": [[1, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "expected a rotation and a shift"),
+])
+def test_numbers_that_a_camera_cannot_have_are_named(
+    recorded: pathlib.Path, tmp_path: pathlib.Path, entry: dict, message: str
+) -> None:
+    whole = json.loads((recorded / "cameras.json").read_text())
+    whole["cameras"][0] |= entry
+    (tmp_path / "cameras.json").write_text(json.dumps(whole))
+    with pytest.raises(camera_files.CameraFileError, match=message):
+        camera_files.read_calibration(tmp_path / "cameras.json")
 
 
 def test_calibrations_that_cannot_be_used_are_named(recorded: pathlib.Path, tmp_path: pathlib.Path) -> None:

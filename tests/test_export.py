@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import failure_of
-from compass import Compass
+from compass import Compass, CompassState
 
 from envs_mjx import registry
-from envs_mjx.base import ArraySpec, ContinuousActions, Environment, Interface
+from envs_mjx.base import ArraySpec, ContinuousActions, Environment, Interface, TimeStep
 from mijax import export
 from mijax.agents.core import Agent
 from mijax.agents.factory import make_agent
@@ -197,6 +197,41 @@ def test_a_policy_refuses_and_remembers_nothing_of_it(observation: object, reaso
     np.testing.assert_array_equal(policy.act([0.5, 0.5]), untouched.act([0.5, 0.5]))
 
 
+def test_a_policy_that_would_remember_no_number_refuses():
+    described = dict(policy_of().contract, action={"shape": [], "dtype": "int32", "low": 0, "high": 1})
+
+    def step(arrays: numpy_policy.Arrays) -> numpy_policy.Arrays:
+        total = arrays["memory.sum"] + arrays["observation"][0] / arrays["observation"][1]
+        return {"action": np.asarray(np.argmax([total, 0]), np.int32), "next_memory.sum": total}
+
+    policy = Policy(described, step)
+    policy.act([0.5, 0.5])
+    with np.errstate(divide="ignore"), pytest.raises(Refused, match="not finite, or would remember one"):
+        policy.act([0.5, 0.0])
+    assert policy.steps == 1
+    assert policy.act([0.5, 0.5]) == 0
+
+
+@pytest.mark.parametrize(("dtype", "carried", "bounds"), [
+    (bool, "uint8", (0, 1)), (np.int16, "int32", (-32768, 32767)), (np.float16, "float32", (None, None))])
+@pytest.mark.parametrize("kind", ["npz", "onnx", "stablehlo"])
+def test_observations_of_any_dtype(dtype: type, carried: str, bounds: tuple, kind: str, tmp_path: pathlib.Path):
+    class Typed(Compass):
+        observation_spec = dataclasses.replace(Compass.observation_spec, dtype=dtype)
+
+        def show(self, env_state: CompassState) -> TimeStep:
+            shown = super().show(env_state)
+            return dataclasses.replace(shown, observation=jnp.round(shown.observation).astype(dtype))
+
+    env = Typed()
+    agent = make_agent(env, dataclasses.replace(CONFIG, agent="base"))
+    policy, found = export.write(
+        kind, agent, agent.init_network(jax.random.key(1)), tmp_path / "out", {}, jax.random.key(0), 2)
+    spec = policy.contract["observation"]
+    assert (spec["dtype"], (spec["low"], spec["high"])) == (carried, bounds)
+    assert found.largest_difference <= parity.TOLERANCE
+
+
 def test_whole_numbers_and_blank_channels():
     whole = policy_of(dtype="uint8", high=None, low=None)
     with pytest.raises(Refused, match="fraction"):
@@ -245,7 +280,8 @@ def exported(run: pathlib.Path) -> pathlib.Path:
 
 
 def test_the_command_writes_a_policy_and_says_so(
-    exported: pathlib.Path, run: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+    exported: pathlib.Path, run: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch
 ):
     assert {path.name for path in exported.iterdir()} == {"policy.json", "policy.npz", "numpy_policy.py", "serve.py"}
     stored = json.loads((exported / "policy.json").read_text())
@@ -260,6 +296,13 @@ def test_the_command_writes_a_policy_and_says_so(
         assert export.main([str(run), "--to", "onnx", "--seed", "3", "--out", str(out), "--episodes", "1"]) == 0
         assert "against the trained agent: 1 episodes" in capsys.readouterr().out
     assert Policy.load(out).contract["run"]["seed"] == 3
+    (out / "my_robot.py").write_text("")
+    assert export.main([str(run), "--to", "npz", "--out", str(out), "--episodes", "1"]) == 0
+    assert {path.name for path in out.iterdir()} == {
+        "policy.json", "policy.npz", "numpy_policy.py", "serve.py", "my_robot.py"}
+    monkeypatch.chdir(out)
+    assert export.main([str(run), "--to", "npz", "--out", ".", "--episodes", "1"]) == 0
+    assert Policy.load(out).contract["parity"]["episodes"] == 1
 
 
 def test_a_policy_needs_numpy_and_nothing_else(exported: pathlib.Path, tmp_path: pathlib.Path):

@@ -17,7 +17,7 @@ from envs_mjx.robot import headless, real_trial, sensors, tabletop
 from envs_mjx.robot.gap import GAPS, Gap
 from envs_mjx.robot.real_trial import ExpertPolicy, RealEpisode
 from envs_mjx.robot.realworld import IMMOVABLE, MOVABLE, NOTHING_TOUCHED, RealState, RealWorld
-from envs_mjx.robot.task import OUTCOMES, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotTask
+from envs_mjx.robot.task import NOT_FINITE, OUTCOMES, RUNNING, STOPPED, SUCCESS, TIME_LIMIT, RobotTask
 from mijax import transfer
 
 NONE = GAPS["none"]
@@ -135,6 +135,17 @@ def test_pressing_onto_an_object_is_a_protective_stop(world: RealWorld) -> None:
     assert env_state.pressed > 50
     assert (bool(shown.terminated), float(shown.reward)) == (True, 0.0)
     assert env_state.first_touched == IMMOVABLE
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_a_broken_simulation_and_a_broken_policy_end_the_episode(world: RealWorld) -> None:
+    start = world.begin(jax.random.key(4))
+    world.advance(jax.random.key(5), start, np.zeros(4))
+    broken = dataclasses.replace(start, physics=np.where(start.physics == 0, np.nan, start.physics))
+    for state, action in ((broken, np.zeros(4)), (start, np.array([0, np.nan, 0, 0]))):
+        after = world.advance(jax.random.key(5), state, action)
+        assert after.outcome == NOT_FINITE
+        np.testing.assert_array_equal(after.robot.qpos, start.robot.qpos)
 
 
 def test_the_expert_succeeds_whichever_comes_first(world: RealWorld) -> None:

@@ -381,8 +381,16 @@ def test_the_closed_gripper_fits_between_a_handle_s_side_bars() -> None:
 
 def test_arguments_of_a_task() -> None:
     assert registry.make("block_pushing,stop_force=12.5,noise=0.007").stop_force == 12.5  # pyright: ignore
-    with pytest.raises(registry.UnknownDomain, match="expected numbers >= 0"):
-        registry.make("block_pushing,expert_noise=-1")
+    for name, value, got in (("expert_noise", "-1", "-1"), ("noise", "abc", "'abc'"), ("noise", "1e999", "inf"),
+                             ("stop_force", "True", "True")):
+        with pytest.raises(registry.UnknownDomain, match=f"{name}: got {got}, accepted: a finite number >= 0"):
+            registry.make(f"block_pushing,{name}={value}")
+
+
+def test_a_policy_accepts_as_much_noise_as_it_was_trained_with() -> None:
+    for noise, margin in ((0.0, 0.021), (0.05, 0.05)):
+        env = registry.make(f"block_pulling,noise={noise}")
+        assert env.interface.observation_range == pytest.approx((-margin, window.DEEPEST + margin))
 
 
 def test_a_task_whose_import_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -217,6 +217,13 @@ def test_a_thousand_malformed_messages_harm_nobody(server: serve.Server, folder:
         assert attacker.ask(observation=GOOD) == {"action": mine.act(GOOD).tolist(), "step": 2}
 
 
+@pytest.mark.parametrize(("option", "value"), [("--port", "70000"), ("--connections", "0")])
+def test_options_that_cannot_be_used_are_named(option: str, value: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        serve.parse_arguments([option, value])
+    assert f"{option}: got {value}, accepted" in capsys.readouterr().err
+
+
 def test_more_connections_than_allowed_are_turned_away(server: serve.Server):
     clients = [Client(server) for _ in range(3)]
     assert all(client.ask(reset=True)["step"] == 0 for client in clients)
@@ -250,5 +257,5 @@ def test_what_cannot_be_served_is_named(tmp_path: pathlib.Path, folder: pathlib.
                                         capsys: pytest.CaptureFixture[str]):
     assert serve.main([str(tmp_path)]) == 1
     assert "no exported policy" in capsys.readouterr().err
-    assert serve.main([str(folder), "--port", "99999"]) == 1
+    assert serve.main([str(folder), "--host", "no.such.host.invalid", "--port", "0"]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -242,14 +242,15 @@ class FromBrax(Environment):
 
     def __init__(
         self, env: Any, *, horizon: int, name: str | None = None, observation_key: str = POLICY_KEY,
-        state_key: str = VALUE_KEY, observed: Sequence[int] | None = None, variables: Sequence[Variable] = (),
+        state_key: str | None = None, observed: Sequence[int] | None = None, variables: Sequence[Variable] = (),
     ) -> None:
         """Args:
             env: has `reset(key)`, `step(state, action)` and `action_size`.
             horizon: time limit in steps; these libraries keep it outside of the environment.
             name: for files and tables; None: the class's.
             observation_key: the entry of the observations that a policy sees.
-            state_key: the one for training only; without such an entry it is the observation's, in full.
+            state_key: the one for training only; None: `privileged_state`, or without such an entry the observation's,
+                in full.
             observed: which numbers of that vector a policy sees, e.g. positions without velocities; None: all.
             variables: a name for each number of the flattened state, for probes.
 
@@ -263,11 +264,12 @@ class FromBrax(Environment):
                 raise ValueError(f"{self.name}: {type(layer).__name__} resets within a step, accepted: the bare "
                                  "environment, e.g. brax.envs.get_environment(name)")
             layer = vars(layer).get("env")
-        self._env, self._keys = env, (observation_key, state_key)
         obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
-        if isinstance(obs, Mapping) and observation_key not in obs:
-            raise ValueError(f"observation_key: {self.name} shows no {observation_key!r}, accepted: "
-                             f"{', '.join(sorted(obs))}")
+        for option, entry in (("observation_key", observation_key), ("state_key", state_key)):
+            if isinstance(obs, Mapping) and entry is not None and entry not in obs:
+                raise ValueError(f"{option}: {self.name} shows no {entry!r}, accepted: {', '.join(sorted(obs))}")
+        state_key = VALUE_KEY if state_key is None else state_key
+        self._env, self._keys = env, (observation_key, state_key)
         self._observed = None if observed is None else np.asarray(observed, np.int32)
         seen, state = jax.eval_shape(lambda obs: self._views(obs), obs)
         whole = obs[observation_key] if isinstance(obs, Mapping) else obs

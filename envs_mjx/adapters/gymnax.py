@@ -19,10 +19,11 @@ from envs_mjx.base import ActionSpec, ArraySpec, ContinuousActions, DiscreteActi
 
 
 class FromGymnax(Environment):
-    """A gymnax environment whose observation is an array.
+    """A gymnax environment, bare, whose observation is an array.
 
-    The state is what gymnax' state holds, flattened: (n,) float32, its fields in order. Continuous actions in [-1, 1]
-    are stretched to the environment's own bounds.
+    The state is what gymnax' state holds, flattened: (n,) float32, its fields in order. An observation that is neither
+    a vector nor an image is flattened, too. Continuous actions in [-1, 1] are stretched to the environment's own
+    bounds.
     """
 
     def __init__(
@@ -37,8 +38,12 @@ class FromGymnax(Environment):
             hidden: those of them that an observation usually does not show: what stage 1's probe looks for in z_s.
 
         Raises:
-            ValueError: no such field, an observation that is no array, no time limit, or actions of another kind.
+            ValueError: a wrapper, no such field, an observation that is no array, no time limit, or actions of another
+                kind.
         """
+        if not isinstance(env, GymnaxEnvironment):  # wrappers change `reset` and `step` alone, which are not used here
+            raise ValueError(f"env: {type(env).__name__} is no environment of gymnax but may wrap one, accepted: what "
+                             "gymnax.make returns; what a wrapper changes belongs in a subclass of FromGymnax")
         self._gymnax, self._params = env, env.default_params if params is None else params
         limit = getattr(self._params, "max_steps_in_episode", None) if horizon is None else horizon
         if limit is None:
@@ -53,7 +58,8 @@ class FromGymnax(Environment):
         if unknown:
             raise ValueError(f"{env.name}: its state has no field {unknown[0]!r}, accepted: {', '.join(names)}")
         sizes = {name: int(np.prod(getattr(inner, name).shape)) for name in self._fields}
-        self.observation_spec = ArraySpec(shown.shape, shown.dtype)
+        shape = shown.shape if len(shown.shape) in (1, 3) else (int(np.prod(shown.shape)),)
+        self.observation_spec = ArraySpec(shape, shown.dtype)
         self.state_spec = ArraySpec((sum(sizes.values()),))
         self.action_spec = self._actions(env.action_space(self._params))
         self.variables = tuple(
@@ -67,8 +73,10 @@ class FromGymnax(Environment):
         if isinstance(space, spaces.Box) and len(space.shape) == 1:
             self._low, self._high = (np.broadcast_to(np.asarray(x, np.float32), space.shape)
                                      for x in (space.low, space.high))
-            return ContinuousActions(int(space.shape[0]))
-        raise ValueError(f"{self.name}: its actions are {type(space).__name__}, accepted: Discrete, or a flat Box")
+            if np.isfinite([self._low, self._high]).all():
+                return ContinuousActions(int(space.shape[0]))
+        raise ValueError(f"{self.name}: its actions are {type(space).__name__}, accepted: Discrete, or a flat Box with "
+                         "bounds")
 
     def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
         """As gymnax resets."""
@@ -95,5 +103,6 @@ class FromGymnax(Environment):
         state, time = env_state
         out_of_time = (time >= self.horizon) | self._gymnax.is_truncated(state, self._params)
         return TimeStep(
-            observation=jnp.asarray(observation, self.observation_spec.dtype), state=self.ground_truth(env_state),
-            reward=reward, terminated=terminated, truncated=out_of_time & ~terminated)
+            observation=jnp.asarray(observation, self.observation_spec.dtype).reshape(self.observation_spec.shape),
+            state=self.ground_truth(env_state), reward=reward, terminated=terminated,
+            truncated=out_of_time & ~terminated)

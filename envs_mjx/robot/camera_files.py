@@ -56,18 +56,25 @@ def read_calibration(path: pathlib.Path) -> dict[str, Calibrated]:
     """The cameras of a calibration by name.
 
     Raises:
-        CameraFileError: when something is missing, or a pose is not a rotation and a shift.
+        CameraFileError: when something is missing, a number cannot be, a name comes twice, or a pose is not a rotation
+            and a shift.
     """
     found = {}
     try:
         for entry in json.loads(path.read_text())["cameras"]:
             intrinsics = np.array([[float(entry[name]) for name in ("fx", "fy", "cx", "cy")]], np.float32)
             pose = np.array(entry["pose"], np.float64)
+            unit, name = float(entry.get("depth_unit", 0.001)), entry["name"]
+            sizes = np.array([*intrinsics[0, :2], float(entry["width"]), float(entry["height"]), unit])
+            if not (np.isfinite(intrinsics).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
+                raise CameraFileError(f"{path}: camera {name!r}: expected finite numbers, and fx, fy, width, height "
+                                      "and depth_unit above 0")
+            if name in found:
+                raise CameraFileError(f"{path}: two cameras of the name {name!r}: expected names that differ")
             if pose.shape != (4, 4) or not _is_rigid(pose):
-                raise CameraFileError(f"{path}: pose of {entry['name']!r}: expected a rotation and a shift, (4, 4)")
-            found[entry["name"]] = Calibrated(
-                Cameras(intrinsics, pose[None].astype(np.float32)), int(entry["height"]), int(entry["width"]),
-                float(entry.get("depth_unit", 0.001)))
+                raise CameraFileError(f"{path}: pose of {name!r}: expected a rotation and a shift, (4, 4)")
+            found[name] = Calibrated(
+                Cameras(intrinsics, pose[None].astype(np.float32)), int(entry["height"]), int(entry["width"]), unit)
     except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
         raise CameraFileError(
@@ -93,7 +100,7 @@ def read_depth(path: pathlib.Path, depth_unit: float = 0.001) -> np.ndarray:
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise CameraFileError(f"{path}: no depth image ({str(error).splitlines()[0]}); expected a 16-bit .png, or an "
                               ".npz with an array 'depth'") from None
-    if image.ndim != 2 or image.dtype == np.uint8 or image.dtype == bool:
+    if image.ndim != 2 or image.dtype.kind not in "iuf" or image.dtype == np.uint8:
         raise CameraFileError(
             f"{path}: {image.dtype} of shape {image.shape}: expected one channel of 16 bits, or floats")
     whole = np.issubdtype(image.dtype, np.integer)
@@ -104,7 +111,9 @@ def read_depth(path: pathlib.Path, depth_unit: float = 0.001) -> np.ndarray:
 def read_ply(path: pathlib.Path) -> np.ndarray:
     """(N, 3) float32: x, y, z of the vertices of a PLY file, in text or binary, in metres."""
     try:
-        header, _, body = path.read_bytes().partition(b"end_header\n")
+        raw = path.read_bytes()
+        end = b"end_header\r\n" if b"end_header\r\n" in raw else b"end_header\n"
+        header, _, body = raw.partition(end)
     except OSError as error:
         raise CameraFileError(f"{path}: cannot be read ({error.strerror})") from None
     words = [line.split() for line in header.decode("ascii", "replace").splitlines()]
@@ -117,7 +126,7 @@ def read_ply(path: pathlib.Path) -> np.ndarray:
         raise CameraFileError(f"{path}: not a PLY file that says how many vertices there are")
     number = int(number)
     vertex = words[elements[0] : [*elements, len(words)][1]]
-    properties = [line[1:] for line in vertex if line[:1] == ["property"]]
+    properties = [line[1:] for line in vertex if line[:1] == ["property"] and len(line) > 2]
     names = [line[-1] for line in properties]
     if not {"x", "y", "z"} <= set(names) or any(line[0] not in _PLY_TYPES for line in properties):
         raise CameraFileError(f"{path}: vertices have {', '.join(names)}: expected numbers, x, y and z among them")
@@ -162,8 +171,8 @@ def read_cloud(path: pathlib.Path, calibration: Mapping[str, Calibrated]) -> Clo
 
 def _is_rigid(pose: np.ndarray) -> bool:
     turn = pose[:3, :3]
-    return (bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4)) and np.linalg.det(turn) > 0
-            and bool(np.allclose(pose[3], [0, 0, 0, 1])))
+    return (bool(np.isfinite(pose).all()) and bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4))
+            and np.linalg.det(turn) > 0 and bool(np.allclose(pose[3], [0, 0, 0, 1])))
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
@@ -189,15 +198,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise CameraFileError(f"--pad: accepted with --domain {padded}, and needed there")
         calibration = read_calibration(options.calibration)
         seen = fuse(*(read_cloud(path, calibration) for path in options.files))
-    except CameraFileError as error:
+        for name, numbers in (("gripper", options.gripper), ("pad", options.pad or ())):
+            if not np.isfinite(numbers).all():
+                raise CameraFileError(f"--{name}: got {' '.join(map(str, numbers))}, accepted: finite numbers")
+        if not seen.measured.any():
+            raise CameraFileError(f"{', '.join(map(str, options.files))}: expected files that measured something")
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+    except (CameraFileError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     pad = None if options.pad is None else np.array(options.pad, np.float32)
     gripper = np.array(options.gripper, np.float32)
     observation = observe(seen, gripper, window.TASKS[options.domain].opening, pad)
-    np.savez_compressed(options.out.with_suffix(".npz"), observation=observation)
-    Image.fromarray(window.grey(observation[..., 0])).save(options.out.with_suffix(".png"))
-    print(f"{int(seen.measured.sum())} points of {len(options.files)} files: {options.out.with_suffix('.npz')}")
+    stored, picture = (options.out.with_name(options.out.name + suffix) for suffix in (".npz", ".png"))
+    np.savez_compressed(stored, observation=observation)
+    Image.fromarray(window.grey(observation[..., 0])).save(picture)
+    print(f"{int(seen.measured.sum())} points of {len(options.files)} files: {stored}")
     return 0
 
 

@@ -82,6 +82,7 @@ class RealWorld(Environment):
         self.observation_spec, self.state_spec = training.observation_spec, training.state_spec
         self.action_spec = training.action_spec
         self.model = tabletop.build(training)
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # pyright: ignore[reportAttributeAccessIssue]
         self._nominal = tabletop.build(training)
         self.data = mujoco.MjData(self.model)  # pyright: ignore[reportAttributeAccessIssue]
         self.cameras = sensors.calibration()
@@ -142,14 +143,15 @@ class RealWorld(Environment):
         """What `step` does, without a look: half a second, or until the task is solved or the robot stops itself."""
         self._resume(env_state)
         start = self.data.qpos[:4].copy()
-        wanted = np.nan_to_num(np.asarray(action, np.float32))
+        wanted = np.asarray(action, np.float32)
         target = np.asarray(scene.target_of(jnp.asarray(start, jnp.float32), jnp.asarray(wanted)))
-        robot, seen, outcome = env_state.robot, None, RUNNING
+        robot, seen = env_state.robot, None
+        outcome = RUNNING if np.isfinite(wanted).all() else NOT_FINITE
         pressed, touched = env_state.pressed, env_state.first_touched
-        for tick in range(1, _TICKS + 1):
+        for tick in range(1, _TICKS + 1 if outcome == RUNNING else 1):
             self.data.ctrl[:] = start + (target - start) * min(tick / _RAMP_TICKS, 1.0)
             mujoco.mj_step(self.model, self.data, _SUBSTEPS)  # pyright: ignore[reportAttributeAccessIssue]
-            if not np.isfinite(self.data.qpos).all():
+            if not (np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all()):
                 outcome = NOT_FINITE
                 break
             force, object_met = self._contact()

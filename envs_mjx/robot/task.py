@@ -5,6 +5,8 @@ Which one is hidden, and drawn anew at every reset. Only touching tells.
 
 import abc
 import dataclasses
+import math
+import numbers
 from collections.abc import Sequence
 
 import jax
@@ -21,7 +23,8 @@ from envs_mjx.base import (
     TimeStep,
     Variable,
 )
-from envs_mjx.robot import depth, noise, rotation, scene, window
+from envs_mjx.robot import depth, rotation, scene, window
+from envs_mjx.robot.noise import AMPLITUDE, perlin
 from envs_mjx.robot.plan import Plan, Stroke
 from envs_mjx.robot.rotation import turn_places, turn_poses, turn_vectors
 
@@ -69,7 +72,7 @@ class RobotTask(Environment):
         observation="channel 0: depth below a camera 6 cm above the gripper, 0 where a finger is; channel 1: zeros. "
                     "The window is 0.4 m x 0.4 m, the gripper where pixels 41 and 42 meet",
         observation_unit="m",
-        observation_range=(-3 * noise.AMPLITUDE, window.DEEPEST + 3 * noise.AMPLITUDE),
+        observation_range=(-3 * AMPLITUDE, window.DEEPEST + 3 * AMPLITUDE),
         action="the gripper's next set-point, relative to where it is",
         action_scale=tuple(scene.ACTION_SCALE.tolist()),
         action_units=("m", "m", "m", "rad"),
@@ -98,14 +101,15 @@ class RobotTask(Environment):
                 error and after an attempt that failed.
 
         Raises:
-            ValueError: for a negative number.
+            ValueError: for anything but a finite number >= 0.
         """
-        if min(noise, stop_force, expert_noise or 0.0) < 0:
-            raise ValueError(
-                f"noise {noise}, stop_force {stop_force}, expert_noise {expert_noise}: expected numbers >= 0")
-        self.noise, self.stop_force = noise, stop_force
-        if expert_noise is not None:
-            self.expert_noise = expert_noise
+        expert_noise = self.expert_noise if expert_noise is None else expert_noise
+        for name, value in (("noise", noise), ("stop_force", stop_force), ("expert_noise", expert_noise)):
+            if isinstance(value, bool) or not isinstance(value, numbers.Real) or not 0 <= value < math.inf:
+                raise ValueError(f"{name}: got {value!r}, accepted: a finite number >= 0")
+        self.noise, self.stop_force, self.expert_noise = noise, stop_force, expert_noise
+        farthest = max(3 * AMPLITUDE, self.noise)
+        self.interface = dataclasses.replace(self.interface, observation_range=(-farthest, window.DEEPEST + farthest))
         self.physics = scene.Physics(self.xml(), self.placed)
 
     placed: Sequence[str]
@@ -221,7 +225,7 @@ class RobotTask(Environment):
         without = jnp.maximum(movable, ground)
         seen = depth.depth(jnp.maximum(without, immovable), env_state.qpos[2], painted)
         if self.noise:
-            seen += noise.perlin(jax.random.wrap_key_data(env_state.noise_key), self.noise)
+            seen += perlin(jax.random.wrap_key_data(env_state.noise_key), self.noise)
         masked = depth.depth(without, env_state.qpos[2], painted)
         return jnp.stack([seen, jnp.zeros_like(seen)], axis=-1), jnp.stack([seen, masked], axis=-1)
 

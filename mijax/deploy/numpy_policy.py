@@ -204,8 +204,9 @@ class Policy:
             previous = checked("previous_action", previous_action, self.contract["action"])
         outputs = self._step({"observation": seen, "previous_action": previous, **self._memory})
         action = np.array(outputs["action"])
-        if not np.isfinite(action).all():
-            raise Refused("the policy answers with a number that is not finite")
+        # The action alone would not tell: the largest of values that are no numbers is the first.
+        if not all(np.isfinite(np.asarray(array, np.float64)).all() for array in outputs.values()):
+            raise Refused("the policy answers with a number that is not finite, or would remember one")
         self._memory = {name: outputs[NEXT + name] for name in self._memory}
         self._previous, self.steps = action, self.steps + 1
         return int(action) if action.ndim == 0 else action.copy()
@@ -217,6 +218,8 @@ def checked(name: str, value: Any, spec: Mapping[str, Any]) -> np.ndarray:
         array = np.asarray(value)
     except (ValueError, OverflowError):
         raise Refused(f"{name}: not an array of numbers") from None
+    if array.dtype.kind == "b" and (spec["dtype"], spec["low"], spec["high"]) == ("uint8", 0, 1):
+        array = array.astype(np.uint8)
     if array.dtype.kind not in "iuf":
         raise Refused(f"{name}: not an array of numbers")
     if array.shape != tuple(spec["shape"]):

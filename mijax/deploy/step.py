@@ -64,7 +64,7 @@ def policy_step(agent: Agent, params: Params) -> PolicyStep:
 
     spec = agent.env.observation_spec
     none = agent.no_action(1)
-    inputs = {"observation": jax.ShapeDtypeStruct(spec.shape, spec.dtype),
+    inputs = {"observation": jax.ShapeDtypeStruct(spec.shape, _carried(spec.dtype)),
               "previous_action": jax.ShapeDtypeStruct(none.shape[1:], none.dtype)}
     inputs |= {name: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype)
                for name, (_, leaf) in zip(names, leaves, strict=True)}
@@ -81,8 +81,9 @@ def contract(agent: Agent, step: PolicyStep) -> dict[str, Any]:
         "memory_kind": memory_of(agent.config), "horizon": env.horizon, "rate_hz": _short(interface.rate),
         "frame": interface.frame,
         "observation": {
-            "name": "observation", "shape": spec.shape, "dtype": np.dtype(spec.dtype).name, "low": low, "high": high,
-            "unit": interface.observation_unit, "meaning": interface.observation, "blank_channels": spec.blank},
+            "name": "observation", "shape": spec.shape, "dtype": step.inputs["observation"].dtype.name, "low": low,
+            "high": high, "unit": interface.observation_unit, "meaning": interface.observation,
+            "blank_channels": spec.blank},
         "action": {"name": "action", "shape": given.shape, "dtype": np.dtype(given.dtype).name,
                    "meaning": interface.action, **_actions(env)},
         "previous_action": {
@@ -105,9 +106,21 @@ def observation_range(env: Environment) -> tuple[float | None, float | None]:
         return _short(low), _short(high)
     listed = env.all_observations()
     if listed is not None:
-        return listed.min().item(), listed.max().item()
+        return (listed.min() * 1).item(), (listed.max() * 1).item()
     dtype = np.dtype(cast(ArraySpec, env.observation_spec).dtype)
+    if dtype.kind == "b":
+        return 0, 1
     return (np.iinfo(dtype).min, np.iinfo(dtype).max) if dtype.kind in "iu" else (None, None)
+
+
+def _carried(dtype: Any) -> np.dtype:
+    """The dtype of observations in an export: of those that every format has, the one that holds the same numbers."""
+    given = np.dtype(dtype)
+    if given.kind == "b":
+        return np.dtype(np.uint8)
+    if given.kind in "iu":
+        return given if given in (np.uint8, np.uint32) else np.dtype(np.int32)
+    return np.dtype(np.float32)
 
 
 def _actions(env: Environment) -> dict[str, Any]:

@@ -159,14 +159,14 @@ def merged(arm: Arm, runs: Sequence[RunFolder], begun: dict[int, int]) -> Report
 
 
 def note_on(request: Request, domains: Sequence[str], steps: dict[str, int]) -> str:
-    """What a figure says of budgets: its own, and the paper's where that is larger."""
+    """What a figure says of budgets, its own and the paper's where that is larger, and of options that were given."""
     parts = []
     for domain in domains:
         own, paper = steps[domain], STEPS.get(registry.plain_name(domain), 0)
         shrunk = own < paper or len(request.seeds) < PAPER_SEEDS
         parts.append(f"{figures.display_name(domain)}: {len(request.seeds)} seed{'s' * (len(request.seeds) > 1)}, "
                      f"{own:,} steps" + (f" (paper: {PAPER_SEEDS} seeds, {paper:,} steps)" if shrunk and paper else ""))
-    return "; ".join(parts)
+    return "; ".join(parts) + (f". With {' '.join(request.extra)}" if request.extra else "")
 
 
 def stage1_samples(request: Request, domain: str, arm: Arm) -> dict[int, int]:

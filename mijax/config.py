@@ -16,7 +16,7 @@ PrivilegedInput = Literal["z_s", "z_s_z_o", "state"]
 IntrinsicForm = Literal["explained_variance", "cosine", "log_likelihood"]
 LowerBound = Literal["jensen_shannon", "variables"]
 StateBound = Literal["jensen_shannon", "conditional"]
-EstimatorView = Literal["features", "directions"]
+EstimatorView = Literal["features", "directions", "raw"]
 DataSource = Literal["random", "demonstrations"]
 """Whose episodes stage 1 learns from: a random policy's, or those of the environment's expert."""
 TrunkKind = Literal["own", "shared", "psi", "z_o"]
@@ -72,6 +72,11 @@ class Stage1Config:
     """Transitions per update; the last partial batch of an epoch is dropped."""
     learning_rate: float = 3e-3
     """Adam step size of phi, psi, the dynamics model and the estimator of CLUB."""
+    final_learning_rate: float = 0.0
+    """That of the first three falls to this fraction of itself, as a half cosine; 1 keeps it constant (paper)."""
+    estimator_learning_rate: float = 0.0
+    """Adam step size of the estimator, which stays constant (paper: 3e-4 on Heaven-Hell, 1e-3 elsewhere); 0: that of
+    the others at their start."""
     warmup: float = 0.0
     """Fraction of training over which that of the first three rises from 0. Adam's first steps are as long as any, in
     directions of single batches; on camera images they can set psi far back, by luck of its start."""
@@ -104,9 +109,9 @@ class Stage1Config:
     estimator_updates: int = 5
     """Updates of CLUB's q(z_o | z_s) per update of the encoders."""
     estimator_view: EstimatorView = "features"
-    """How q sees z_s. features: each brought to variance 1 (ours; the paper: as they are). directions: each principal
-    direction of a batch is, so that what leaks into directions of little variance is seen as well, down to a
-    ten-thousandth of the whole."""
+    """How q sees z_s. features: each brought to variance 1. directions: each principal direction of a batch is, so that
+    what leaks into directions of little variance is seen as well, down to a ten-thousandth of the whole. In both cases
+    each feature of z_o is brought to variance 1 as well. raw: z_s and z_o as they are (paper)."""
     lambda_kl: float = 0.0
     """Weight of Believer's penalty KL[N(phi(s), 1) || N(0, 1)]; above 0, training draws z_s from that Gaussian."""
     rewarded: int = 0
@@ -130,6 +135,10 @@ class Stage1Config:
         require(self.heldout_episodes >= 2, "stage1.heldout-episodes", self.heldout_episodes,
                 "at least 2: probes are fitted on one half and scored on the other")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
+        require(self.estimator_learning_rate >= 0, "stage1.estimator-learning-rate", self.estimator_learning_rate,
+                "a number >= 0")
+        require(0 <= self.final_learning_rate <= 1, "stage1.final-learning-rate", self.final_learning_rate,
+                "a number in [0, 1]")
         require(0 <= self.club_ramp <= 1, "stage1.club-ramp", self.club_ramp, "a number in [0, 1]")
         require(0 <= self.warmup < 1, "stage1.warmup", self.warmup, "a number in [0, 1)")
 
@@ -334,7 +343,10 @@ class InformationConfig:
     """What the privileged features z_s are used for in stage 2 (paper Section 3.2)."""
 
     auxiliary_weight: float = 0.5
-    """Weight of the memory branch's prediction of z_s, in fractions of the variance of z_s."""
+    """Weight of the memory branch's prediction of z_s."""
+    auxiliary_in_variances: bool = True
+    """Whether that error counts in fractions of Tr Var(z_s), so that one weight suits features of any scale; otherwise
+    as the squared norm of Eq. 5 (paper)."""
     intrinsic_weight: float = 0.5
     """alpha: weight of the information bonus in the total reward."""
     intrinsic_form: IntrinsicForm = "log_likelihood"

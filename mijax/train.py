@@ -84,7 +84,8 @@ def parse(arguments: Sequence[str]) -> TrainOptions:
     if known.preset == "paper":
         # Robots are not made here: their physics starts JAX, before its devices are set.
         robot = registry.plain_name(known.domain) in configs.ROBOTS
-        config = paper(config, not robot and not registry.make(known.domain).observation_spec.is_image)
+        vector = not robot and not registry.make(known.domain).observation_spec.is_image
+        config = paper(config, vector, known.steps)
     default = TrainOptions(config=config)
     return tyro.cli(TrainOptions, default=default, args=list(arguments), prog="python -m mijax.train")
 
@@ -108,7 +109,7 @@ def unread_options(config: Config, env: Environment) -> list[str]:
     """Options that differ from both presets, and that the agent never looks at, or replaces: Believer some of stage 1.
     """
     ours = configs.preset(config.domain)
-    presets = [options_of(preset) for preset in (ours, paper(ours, not env.observation_spec.is_image))]
+    presets = [options_of(preset) for preset in (ours, paper(ours, not env.observation_spec.is_image, config.steps))]
     continuous = isinstance(env.action_spec, ContinuousActions)
     used = options_of(dataclasses.replace(config, stage1=stage1_of(config)))
     return [f"--{name.replace('_', '-')}" for name, value in options_of(config).items()

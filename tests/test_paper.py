@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from PIL import Image
 from tiny_runs import TINY, comparable
 
 from launch import paper
 from launch.experiments import AGENTS, DOMAINS, EXPERIMENTS, ablations, memories, overlap, parts
-from mijax import tables
+from mijax import figures, tables
 from mijax.results import ReportedRun
 from mijax.run_folder import RunError, RunFolder
 
@@ -78,6 +80,48 @@ def test_only_what_an_agent_reads_must_be_the_same(tmp_path: pathlib.Path) -> No
         paper.check_same(run, options)
 
 
+def test_a_figure_says_what_it_was_given() -> None:
+    request = paper.Request(pathlib.Path("out"), None, (0, 1), 600, ())
+    assert paper.note_on(request, ["sphinx"], {"sphinx": 600}) == (
+        "Sphinx: 2 seeds, 600 steps (paper: 5 seeds, 500,000 steps)")
+    whole = dataclasses.replace(request, seeds=(0, 1, 2, 3, 4), extra=("--sac.demonstrations", "3"))
+    assert paper.note_on(whole, ["block_pulling"], {"block_pulling": 40_000}) == (
+        "Block-Pulling: 5 seeds, 40,000 steps. With --sac.demonstrations 3")
+
+
+def test_agents_are_charged_for_the_random_steps_of_their_features() -> None:
+    request = paper.Request(pathlib.Path("out"), "heaven_hell", (0, 1), None, ())
+    ours, base, *_, believer = (paper.stage1_samples(request, "heaven_hell", arm) for arm in AGENTS)
+    assert ours == {0: 6423, 1: 6647}
+    assert base == {0: 0, 1: 0}
+    assert min(believer.values()) > 6000
+
+
+def test_curves_are_drawn_where_the_numbers_are(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))
+    steps = tuple(range(10, 210, 10))
+    ours = dataclasses.replace(run_solved_at("ours", [None, 10, 10, 10, 10, 10], steps), colour="#0000ff",
+                               begun=dict.fromkeys(range(6), 40))
+    figures.draw_groups({"Sphinx": [ours]}, tmp_path / "figure.png", title="title")
+    mean, middle = drawn[0].axes
+
+    def curve(axis: Axes) -> np.ndarray:
+        return next(np.asarray(line.get_xydata()) for line in axis.lines if line.get_linewidth() == 1.8)
+
+    def band(axis: Axes) -> np.ndarray:
+        return np.asarray(axis.collections[0].get_paths()[0].vertices)[:, 1]
+
+    np.testing.assert_array_equal(curve(mean)[[0, -1], 0], [50, 240])
+    np.testing.assert_allclose(curve(mean)[:, 1], 5 / 6)
+    np.testing.assert_allclose(curve(middle)[:, 1], 1)
+    std = np.std([0, 1, 1, 1, 1, 1], ddof=1)
+    np.testing.assert_allclose([band(mean).min(), band(mean).max()], [5 / 6 - std, 5 / 6 + std])
+    assert band(middle).min() < 1
+    for axis in drawn[0].axes:
+        assert 40 in {line.get_xdata()[0] for line in axis.lines}  # pyright: ignore[reportIndexIssue]
+
+
 def command(out: pathlib.Path) -> list[str]:
     """The options that all runs here share."""
     return ["--domain", "heaven_hell", "--steps", "600", "--out", str(out), *OPTIONS]
@@ -89,6 +133,21 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     out = tmp_path_factory.mktemp("paper")
     assert paper.main(["fig5", "--seeds", "1", *command(out)]) == 0
     return out
+
+
+def test_one_arm_of_an_experiment_is_trained_once(tmp_path: pathlib.Path) -> None:
+    arguments = ["fig3", "--seeds", "1", "--arms", "base", *command(tmp_path)]
+    assert paper.main(arguments) == 0
+    text = (tmp_path / "fig3_heaven_hell.md").read_text()
+    assert "1 seed, 600 steps (paper: 5 seeds, 500,000 steps). With --" in text
+    assert "Left out: Ours, ZP-DRQN" in text
+    assert "| DTQN" in text
+    before = contents(tmp_path)
+    (tmp_path / "fig3_heaven_hell.png").unlink()
+    assert paper.main(arguments) == 0
+    assert contents(tmp_path) == before
+    with Image.open(tmp_path / "fig3_heaven_hell.png") as image:
+        assert min(image.size) > 300
 
 
 def contents(out: pathlib.Path) -> dict[pathlib.Path, tuple[int, int]]:

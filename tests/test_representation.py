@@ -21,7 +21,7 @@ from mijax.representation import train as training
 from mijax.representation.dataset import Transitions, collect, tabulate
 from mijax.representation.model import evaluate
 from mijax.representation.probe import ROUND_OFF, Decoding, format_report, probe, whiten
-from mijax.representation.problem import Problem
+from mijax.representation.problem import Batch, Problem
 from mijax.representation.storage import PARAMETERS_FILE, RepresentationError, load_representation, save_representation
 from mijax.representation.train import (
     ENCODER_NETWORKS,
@@ -31,9 +31,11 @@ from mijax.representation.train import (
     dim_loss,
     encode,
     encoder_loss,
+    features,
     initial_state,
     optimizers,
     representation_of,
+    seen_by_estimator,
     shrink,
     standardize_directions,
 )
@@ -233,6 +235,59 @@ def test_the_conditional_bound_asks_for_what_is_hidden_alone(env):
     terms, _ = objective(env, config, LossWeights.of(config))
     plain, _ = objective(env, dataclasses.replace(config, state_bound="jensen_shannon"), LossWeights.of(config))
     assert terms["dim_s_loss"] != plain["dim_s_loss"]
+
+
+@pytest.mark.lenient
+def test_next_features_are_predicted_from_actions_and_none_after_the_end(env):
+    config = dataclasses.replace(SMALL, episodes=60, batch_size=500)
+    problem = Problem.of(env, config, collect(env, jax.random.key(0), config.episodes))
+    state, weights = initial_state(problem, jax.random.key(1)), LossWeights.of(config)
+    batch = problem.batch(jnp.arange(config.batch_size), jax.random.key(2))
+    _, optimizer = optimizers(config, 1, 0.0)
+
+    @jax.jit
+    def terms(batch: Batch) -> dict[str, jax.Array]:
+        return encoder_loss(state.parameters, state.estimator, problem, weights, batch, optimizer)[1][1]
+
+    rows, f = jax.device_get(batch.rows), features(problem, state.parameters, batch)
+    _, guess_s, guess_o = evaluate(problem.networks.dynamics, state.parameters["dynamics"], f.z_s, f.z_o,
+                                   problem.networks.encode_action(batch.rows.action))
+    goes_on = [i for i in range(rows.size) if not rows.terminal[i]]
+    assert 0 < len(goes_on) < rows.size
+    total = sum(float(batch.weight[i]) for i in goes_on)
+    found = terms(batch)
+    for name, guess, target in (("z_s_loss", guess_s, f.next_z_s), ("z_o_loss", guess_o, f.next_z_o)):
+        error = sum(float(batch.weight[i]) * np.sum(np.square(guess[i] - target[i])) for i in goes_on) / total
+        assert found[name] == pytest.approx(error, rel=1e-4)
+    other = dataclasses.replace(batch, rows=dataclasses.replace(batch.rows, action=(batch.rows.action + 1) % 4))
+    for name in ("reward_loss", "z_s_loss", "z_o_loss"):
+        assert terms(other)[name] != pytest.approx(float(found[name]), rel=1e-4)
+
+
+@pytest.mark.lenient
+def test_the_paper_s_club_sees_features_as_they_are(env):
+    config = dataclasses.replace(SMALL, estimator_updates=1)
+    found = {view: objective(env, dataclasses.replace(config, estimator_view=view), LossWeights.of(config))[0]["club"]
+             for view in ("features", "raw")}
+    assert found["features"] != pytest.approx(found["raw"], rel=1e-3)
+    z_s, z_o = jnp.arange(6.0).reshape(3, 2), -jnp.arange(6.0).reshape(3, 2)
+    for got, given in zip(seen_by_estimator("raw", z_s, z_o, jnp.full(3, 1 / 3)), (z_s, z_o), strict=True):
+        np.testing.assert_array_equal(got, given)
+
+
+@pytest.mark.lenient
+def test_step_sizes_fall_as_far_as_they_should():
+    zeros = dict.fromkeys(ENCODER_NETWORKS, jnp.zeros(1))
+    ones = jax.tree.map(jnp.ones_like, zeros)
+    for final, expected in ((0.0, 0.0), (1.0, 0.01), (0.5, 0.005)):
+        config = dataclasses.replace(SMALL, learning_rate=0.01, final_learning_rate=final, estimator_learning_rate=0.2)
+        encoders, estimator = optimizers(config, 10, 0.0)
+        state = encoders.init(zeros)
+        for _ in range(11):
+            step, state = encoders.update(ones, state, zeros)
+        assert float(cast(Any, step)["psi"][0]) == pytest.approx(-expected, abs=1e-6)
+        step, _ = estimator.update(ones, estimator.init(ones))
+        assert float(cast(Any, step)["psi"][0]) == pytest.approx(-0.2, rel=1e-4)
 
 
 def test_directions_of_little_variance_are_seen_as_well():

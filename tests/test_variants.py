@@ -101,6 +101,21 @@ def test_self_prediction_by_hand():
     assert loss == pytest.approx(metrics["loss/td"] + np.mean(errors), rel=1e-4)
 
 
+def test_the_next_summary_is_predicted_from_the_action_that_leads_there():
+    case = Case("zp")
+    row, first, end = SPANS[0]
+    taken = case.tokens.previous_action  # at token t, the action that led there
+
+    def predicted(token: int) -> np.ndarray:
+        changed = dataclasses.replace(case.tokens, previous_action=taken.at[row, token].set(1 - taken[row, token]))
+        return np.asarray(case.outputs(changed).next_summary)
+
+    before = np.asarray(case.outputs().next_summary)
+    last = end - 1
+    assert not np.allclose(predicted(last)[row, last - 1], before[row, last - 1])
+    np.testing.assert_array_equal(predicted(last)[row, first : last - 1], before[row, first : last - 1])
+
+
 def test_belief_loss_by_hand():
     case = Case("believer", network=TINY)
     rep = case.representation

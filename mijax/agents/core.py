@@ -287,7 +287,8 @@ class Agent(abc.ABC):
             scale = cast(Representation, representation)
             loss_k, parts = info.prediction_mse(
                 scale.destandardise(online.z_s), cast(jax.Array, tokens.z_s), real, scale.z_s_variance)
-            loss += self.config.information.auxiliary_weight * loss_k
+            unit = 1.0 if self.config.information.auxiliary_in_variances else scale.z_s_variance
+            loss += self.config.information.auxiliary_weight * loss_k * unit
             metrics |= {"loss/auxiliary": loss_k, "auxiliary/explained": parts["explained"]}
         if online.next_summary is not None:
             later = jax.lax.stop_gradient(cast(jax.Array, averaged.summary))[:, 1:]

@@ -19,7 +19,7 @@ from mijax.losses.club import club_all_pairs
 from mijax.losses.information import LEAST_LOG_VARIANCE, log_likelihood_bonus
 from mijax.representation.dataset import Transitions, collect
 from mijax.representation.model import evaluate, networks_for
-from mijax.representation.train import History, encode_frames, seen_by_estimator, standardize
+from mijax.representation.train import History, encode_frames, seen_by_estimator
 from mijax.types import Representation
 
 ROUND_OFF = 1e-5
@@ -308,8 +308,8 @@ def _errors(
     reward, guess_s, guess_o = evaluate(
         networks.dynamics, history.dynamics, z_s, z_o, networks.encode_action(data.action))
     weight = jnp.full(data.size, 1 / data.size, jnp.float32)
-    mean, log_variance = evaluate(
-        networks.estimator, history.estimator, seen_by_estimator(history.estimator_view, z_s, weight))
+    given, guessed = seen_by_estimator(history.estimator_view, z_s, z_o, weight)
+    mean, log_variance = evaluate(networks.estimator, history.estimator, given)
     goes_on = ~np.asarray(data.terminal)
 
     def error(guess: jax.Array, actual: jax.Array, rows: np.ndarray) -> float:
@@ -321,7 +321,7 @@ def _errors(
         "reward_r2": 1 - error(reward, data.reward, np.ones(data.size, bool)),
         "next_z_s_error": error(guess_s, next_z_s, goes_on),
         "next_z_o_error": error(guess_o, next_z_o, goes_on),
-        "club": float(club_all_pairs(standardize(z_o, weight), mean, log_variance, weight)[0]),
+        "club": float(club_all_pairs(guessed, mean, log_variance, weight)[0]),
     }
 
 

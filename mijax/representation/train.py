@@ -143,17 +143,20 @@ class History:
 def optimizers(
     config: Stage1Config, updates: int, phi_shrinkage: Weight
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Adam for the encoders and the dynamics model, its step size falling to 0 as a half cosine, after a rise if there
-    is a warm-up, with the shrinkage of phi; and Adam at a constant step size for the estimator, which has to follow to
-    the end.
+    """Adam for the encoders and the dynamics model, its step size falling as a half cosine, after a rise if there is a
+    warm-up, with the shrinkage of phi; and Adam at a constant step size for the estimator, which has to follow to the
+    end.
     """
-    step_size = optax.cosine_decay_schedule(config.learning_rate, updates)
+    final = config.final_learning_rate
+    step_size = optax.cosine_decay_schedule(config.learning_rate, updates, final)
     if rise := int(config.warmup * updates):  # fewer than all, which optax refuses
-        step_size = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, rise, updates)
+        step_size = optax.warmup_cosine_decay_schedule(
+            0.0, config.learning_rate, rise, updates, final * config.learning_rate)
     plain = optax.adam(step_size)
     names = {name: "phi" if name == "phi" else "others" for name in ENCODER_NETWORKS}
     shrinking = optax.chain(plain, shrink(phi_shrinkage, step_size))
-    return optax.partition({"phi": shrinking, "others": plain}, names), optax.adam(config.learning_rate)
+    return optax.partition({"phi": shrinking, "others": plain}, names), optax.adam(
+        config.estimator_learning_rate or config.learning_rate)
 
 
 def shrink(strength: Weight, step_size: optax.Schedule) -> optax.GradientTransformation:
@@ -225,9 +228,13 @@ def standardize_directions(z: jax.Array, weight: jax.Array) -> jax.Array:
     return centered @ (directions * scale[None]) @ directions.T
 
 
-def seen_by_estimator(view: EstimatorView, z_s: jax.Array, weight: jax.Array) -> jax.Array:
-    """(B, F) z_s as CLUB's q sees it, under (B,) probabilities; see `Stage1Config.estimator_view`."""
-    return (standardize_directions if view == "directions" else standardize)(z_s, weight)
+def seen_by_estimator(
+    view: EstimatorView, z_s: jax.Array, z_o: jax.Array, weight: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """(B, F) z_s and z_o as CLUB's q sees them, under (B,) probabilities; see `Stage1Config.estimator_view`."""
+    if view == "raw":
+        return z_s, z_o
+    return (standardize_directions if view == "directions" else standardize)(z_s, weight), standardize(z_o, weight)
 
 
 def features(problem: Problem, parameters: dict[str, Params], batch: Batch) -> Features:
@@ -290,13 +297,13 @@ def encoder_loss(
     fit = fit_estimator(fit, problem, batch, f.z_s, f.z_o, optimizer)
     reward, predicted_z_s, predicted_z_o = evaluate(
         networks.dynamics, parameters["dynamics"], f.z_s, f.z_o, networks.encode_action(rows.action))
-    mean, log_variance = evaluate(
-        networks.estimator, fit.parameters, seen_by_estimator(problem.config.estimator_view, f.z_s, weight))
+    given, guessed = seen_by_estimator(problem.config.estimator_view, f.z_s, f.z_o, weight)
+    mean, log_variance = evaluate(networks.estimator, fit.parameters, given)
     terms = {
         "reward_loss": (weights.lambda_r, reward_loss(reward, rows.reward, batch.reward_weight)[0]),
         "z_s_loss": (weights.lambda_s, next_feature_loss(predicted_z_s, f.next_z_s, rows.terminal, weight)[0]),
         "z_o_loss": (weights.lambda_o, next_feature_loss(predicted_z_o, f.next_z_o, rows.terminal, weight)[0]),
-        "club": (weights.lambda_club, club_all_pairs(standardize(f.z_o, weight), mean, log_variance, weight)[0]),
+        "club": (weights.lambda_club, club_all_pairs(guessed, mean, log_variance, weight)[0]),
     }
     if batch.noise is not None:
         terms["kl"] = problem.config.lambda_kl, weight @ kl_standard_normal(mean_z_s, jnp.zeros_like(mean_z_s))
@@ -322,8 +329,7 @@ def fit_estimator(
     optimizer: optax.GradientTransformation
 ) -> EstimatorState:
     """Move q(z_o | z_s) towards the current features, which stay constant, `estimator_updates` times on this batch."""
-    z_s = jax.lax.stop_gradient(seen_by_estimator(problem.config.estimator_view, z_s, batch.weight))
-    z_o = jax.lax.stop_gradient(standardize(z_o, batch.weight))
+    z_s, z_o = jax.lax.stop_gradient(seen_by_estimator(problem.config.estimator_view, z_s, z_o, batch.weight))
 
     def loss(parameters: Params) -> jax.Array:
         mean, log_variance = evaluate(problem.networks.estimator, parameters, z_s)

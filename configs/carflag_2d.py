@@ -3,7 +3,7 @@
     python -m mijax.train --domain carflag_2d
 
 1.001, 0.998 and 0.998 of the optimum, solved first after 40 000, 25 000 and 32 000 steps (results/carflag_2d_mi and
-carflag_2d_mi_seed_1, _seed_2). Twenty-five minutes a seed on one core, of them six to seven for stage 1.
+carflag_2d_mi_seed_1, _seed_2). Twenty-seven minutes a seed on one core, of them six for stage 1.
 
 Stage 1 departs from Table 3, with which z_s never learnt the goal here: the random policy meets the reward once in 250
 steps, too rarely to tell phi where the goal is from so few episodes. So states that show the same observation have to

@@ -73,10 +73,8 @@ class Stage1Config:
     learning_rate: float = 3e-3
     """Adam step size of phi, psi, the dynamics model and the estimator of CLUB."""
     final_learning_rate: float = 0.0
-    """That of the first three falls to this fraction of itself, as a half cosine; 1 keeps it constant (paper)."""
-    estimator_learning_rate: float = 0.0
-    """Adam step size of the estimator, which stays constant (paper: 3e-4 on Heaven-Hell, 1e-3 elsewhere); 0: that of
-    the others at their start."""
+    """That of the first three falls to this fraction of itself, as a half cosine; 1 keeps it constant (paper), as that
+    of the estimator always is."""
     warmup: float = 0.0
     """Fraction of training over which that of the first three rises from 0. Adam's first steps are as long as any, in
     directions of single batches; on camera images they can set psi far back, by luck of its start."""
@@ -111,7 +109,8 @@ class Stage1Config:
     estimator_view: EstimatorView = "features"
     """How q sees z_s. features: each brought to variance 1. directions: each principal direction of a batch is, so that
     what leaks into directions of little variance is seen as well, down to a ten-thousandth of the whole. In both cases
-    each feature of z_o is brought to variance 1 as well. raw: z_s and z_o as they are (paper)."""
+    each feature of z_o is brought to variance 1 as well. raw: z_s and z_o as they are (paper), with which the encoders
+    may outrun q: on Heaven-Hell CLUB then fell to -3e18 by the paper's other numbers."""
     lambda_kl: float = 0.0
     """Weight of Believer's penalty KL[N(phi(s), 1) || N(0, 1)]; above 0, training draws z_s from that Gaussian."""
     rewarded: int = 0
@@ -135,8 +134,6 @@ class Stage1Config:
         require(self.heldout_episodes >= 2, "stage1.heldout-episodes", self.heldout_episodes,
                 "at least 2: probes are fitted on one half and scored on the other")
         require(self.learning_rate > 0, "stage1.learning-rate", self.learning_rate, "a number > 0")
-        require(self.estimator_learning_rate >= 0, "stage1.estimator-learning-rate", self.estimator_learning_rate,
-                "a number >= 0")
         require(0 <= self.final_learning_rate <= 1, "stage1.final-learning-rate", self.final_learning_rate,
                 "a number in [0, 1]")
         require(0 <= self.club_ramp <= 1, "stage1.club-ramp", self.club_ramp, "a number in [0, 1]")

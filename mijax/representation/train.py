@@ -155,8 +155,7 @@ def optimizers(
     plain = optax.adam(step_size)
     names = {name: "phi" if name == "phi" else "others" for name in ENCODER_NETWORKS}
     shrinking = optax.chain(plain, shrink(phi_shrinkage, step_size))
-    return optax.partition({"phi": shrinking, "others": plain}, names), optax.adam(
-        config.estimator_learning_rate or config.learning_rate)
+    return optax.partition({"phi": shrinking, "others": plain}, names), optax.adam(config.learning_rate)
 
 
 def shrink(strength: Weight, step_size: optax.Schedule) -> optax.GradientTransformation:

@@ -87,6 +87,9 @@ def read(path: pathlib.Path, out: pathlib.Path) -> Sweep:
             f"YAML with a mapping `grid`, and optionally {', '.join(key for key in KEYS if key != 'grid')}")
     unknown = sorted(set(content) - set(KEYS))
     require(not unknown, "spec", unknown[0] if unknown else "", f"the keys {', '.join(KEYS)}")
+    for key in ("options", "resources"):
+        value = content.get(key) or {}
+        require(isinstance(value, dict), f"spec {key}", value, "a mapping of names to values")
     resources = {"cpus": 1, "gpus": 0} | (content.get("resources") or {})
     unknown = sorted(set(resources) - set(RESOURCES))
     require(not unknown, "spec resources", unknown[0] if unknown else "", f"the keys {', '.join(RESOURCES)}")
@@ -94,7 +97,8 @@ def read(path: pathlib.Path, out: pathlib.Path) -> Sweep:
                               ("retries", content.get("retries", 2), 0)):
         require(isinstance(value, int | float) and value >= least, f"spec {key}", value, f"a number >= {least}")
     jobs = tuple(_jobs(content, out))
-    for job in jobs:
+    for number, job in enumerate(jobs):
+        require(job.name not in {other.name for other in jobs[:number]}, "spec", job.name, "every job once")
         check(job)
     return Sweep(jobs, int(resources["cpus"]), float(resources["gpus"]), int(content.get("retries", 2)))
 

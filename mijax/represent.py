@@ -34,7 +34,8 @@ class RepresentOptions:
     """How many loss weightings to try in place of --stage1.lambda-* and --stage1.phi-shrinkage (a DIM weight of 0 stays
     0). 0: none, the weights are taken as they are."""
     out: pathlib.Path | None = None
-    """Run folder to make; default runs/DOMAIN-representation. `mijax.train --representation` reads it."""
+    """Run folder to make, or one of the same options to add seeds to; default runs/DOMAIN-representation.
+    `mijax.train --representation` reads it."""
 
 
 def parse(arguments: Sequence[str]) -> RepresentOptions:
@@ -47,13 +48,14 @@ def parse(arguments: Sequence[str]) -> RepresentOptions:
 
 
 def open_run(options: RepresentOptions, seeds: Sequence[int]) -> RunFolder:
-    """A new run folder, or the one that the same command made before it was stopped."""
+    """A new run folder, or the one that the same command made before, for the same seeds or for others."""
     path = options.out or pathlib.Path("runs") / f"{registry.file_name(options.domain)}-representation"
     stored = dataclasses.asdict(options) | {"seed_list": list(seeds), "out": None}
     if (path / "config.json").exists():
         run = RunFolder.open(path)
         other = [name for name, value in _flat(stored).items() if _flat(run.config()).get(name, value) != value]
         if not options.search and not other:
+            run.add_seeds(seeds)
             return run
         named = f"with another --{other[0].replace('_', '-')}" if other else "by a search"
         raise RunError(f"{path}: was made {named}; choose another --out")
@@ -61,9 +63,9 @@ def open_run(options: RepresentOptions, seeds: Sequence[int]) -> RunFolder:
 
 
 def _flat(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Options by their names on the command line, with underscores."""
+    """Options by their names on the command line, with underscores, but for the seeds."""
     stage1 = {f"stage1.{name}": value for name, value in dict(stored.get("stage1") or {}).items()}
-    return {name: value for name, value in stored.items() if name not in ("stage1", "seed_list")} | stage1
+    return {name: value for name, value in stored.items() if name not in ("stage1", "seeds", "seed_list")} | stage1
 
 
 def represent(options: RepresentOptions) -> None:

@@ -153,6 +153,14 @@ class RunFolder:
         if changed != config:
             _write_json(self._file("config.json"), changed)
 
+    def add_seeds(self, seeds: Sequence[int]) -> None:
+        """Count more seeds to the run's."""
+        config = self.config()
+        every = sorted({*config.get("seed_list", ()), *seeds})
+        if every != config.get("seed_list"):
+            _write_json(self._file("config.json"), config | {
+                "seed_list": every, "seeds": ",".join(map(str, every)) + ","})
+
     def versions(self) -> dict[str, Any]:
         """What the run was started with: python, packages, platform, commit."""
         return _read_json(self._file("versions.json"))

@@ -39,6 +39,7 @@ from mijax.representation.train import (
     shrink,
     standardize_directions,
 )
+from mijax.run_folder import RunFolder
 
 SMALL = Stage1Config(episodes=20, heldout_episodes=20, epochs=2, batch_size=200, features=8, lambda_dim_s=0.1)
 
@@ -560,6 +561,12 @@ def test_the_command_learns_probes_and_keeps(tmp_path, capsys):
     assert represent.main(["--domain", "heaven_hell", *options]) == 0  # goes on where it was: at the end
     assert "of 1 representations pass" in capsys.readouterr().out
     assert (folder / "representation.msgpack").stat().st_mtime_ns == made
+    assert represent.main(["--domain", "heaven_hell", *options, "--seeds", "2,3"]) == 0  # one more
+    assert "of 2 representations pass" in capsys.readouterr().out
+    assert (folder / "representation.msgpack").stat().st_mtime_ns == made
+    run = RunFolder.open(tmp_path / "run")
+    assert run.seeds() == (2, 3)
+    assert (run.config()["seed_list"], run.config()["seeds"]) == ([2, 3], "2,3,")
     assert represent.main(["--domain", "heaven_hell", *options, "--stage1.lambda-r", "2"]) == 1
     assert "was made with another --stage1.lambda-r; choose another --out" in capsys.readouterr().err
     assert represent.main(["--domain", "heaven_hell", *options, "--search", "2"]) == 1

@@ -1,7 +1,7 @@
 """The agents of the paper: what each network sees, and the losses that set it apart, against loops."""
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -99,6 +99,18 @@ def test_self_prediction_by_hand():
     loss, metrics = case.losses()
     assert metrics["loss/self_prediction"] == pytest.approx(np.mean(errors), rel=1e-4)
     assert loss == pytest.approx(metrics["loss/td"] + np.mean(errors), rel=1e-4)
+
+
+def test_the_auxiliary_error_counts_in_variances_or_as_it_is():
+    found = {}
+    for in_variances in (True, False):
+        case = Case("mi", information=dataclasses.replace(
+            CONFIG.information, auxiliary_in_variances=in_variances, auxiliary_weight=0.5))
+        found[in_variances], metrics = case.losses()
+    variance = float(cast(Any, case.representation).z_s_variance)
+    assert variance != 1
+    added = found[False] - found[True]
+    assert added == pytest.approx(0.5 * metrics["loss/auxiliary"] * (variance - 1), rel=1e-3)
 
 
 def test_the_next_summary_is_predicted_from_the_action_that_leads_there():

@@ -272,6 +272,20 @@ def test_an_expert_knows_its_task_by_any_name(domain: str) -> None:
     np.testing.assert_array_equal(action, other)
 
 
+@pytest.mark.parametrize("domain", DOMAINS)
+def test_an_expert_begins_with_the_nearer_object_where_an_imitator_would_go_between_both(domain: str) -> None:
+    env = make(domain)
+
+    def chosen_and_nearer(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        env_state = env.reset(key)[0]
+        distance = jnp.linalg.norm(env.object_poses(env_state)[:, :2] - env_state.qpos[None, :2], axis=1)
+        return Planner(env).start(key, env_state).chosen, jnp.argmin(distance)
+
+    chosen, nearer = jax.jit(jax.vmap(chosen_and_nearer))(jax.random.split(jax.random.key(0), 64))
+    share = float((chosen == nearer).mean())
+    assert share == 1 if domain in ("block_pushing", "drawer_opening") else 0.3 < share < 0.7
+
+
 def test_changing_over() -> None:
     """An expert whose object stands still works on the other one, after retreating for two steps."""
     env = DrawerOpening()

@@ -12,7 +12,7 @@ worlds' step size and target rate the values of one seed in three ran away, to 3
 hence half of both, and values bounded by 1 (results/what_matters.md).
 
 The test of stage 1 fails, as 1000 episodes hold too few rewards. With 20 000 episodes, 8 epochs and lambda_r 3 it
-passes in four seeds of five (results/carflag_2d_passes), which costs more random steps than the agent needs.
+passes in four seeds of five (results/carflag_2d_20000_episodes), which costs more random steps than the agent needs.
 """
 
 from mijax.config import Config, DQNConfig, InformationConfig, NetworkConfig, Stage1Config
